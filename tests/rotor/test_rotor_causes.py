@@ -88,7 +88,7 @@ def test_a_late_current_is_late_where_it_is_the_input(sound: Any) -> None:
     late = changed(record, ax_current=lambda x: lfilter([1.0 - pole], [1.0, -pole], x, zi=[pole * x[0]])[0])
     check = ambid.identify(late, driven(rig, 6.0)).checks["sensors_agree"]
     assert (check.passed, check.cause) == (False, "ax_current.lag")
-    assert check.size == pytest.approx(1.0 / (2.0 * np.pi * 2000.0), rel=0.6)
+    assert check.size == pytest.approx(pole / (1.0 - pole) / record.rate_hz, rel=0.1)
     assert not [x for x in check.alternatives if "voltage" in x]
 
 
@@ -162,7 +162,7 @@ def test_hum_is_named_and_taken_out(sound: Any, frequency: float) -> None:
     on = frequency == 52.0
     assert found.verdict.word == ("caution" if on else "usable"), found.verdict.reasons
     assert [k for k, c in found.checks.items() if not c.passed] == ["lines"] * on
-    assert found.checks["lines"].alternatives == ("mode",) * on
+    assert not on or found.checks["lines"].alternatives == ("mode",)
     said = [w for w in found.warnings if "lines were taken out" in w]
     assert len(said) == 1
     told, where = said[0].split("taken out: ")[1].split(". ")[0].split(" Hz in ")

@@ -182,7 +182,7 @@ def _from_periods(
     least = min(x.count for x in excitations)
     return _Found(
         fit=fit, evidence=of_periods(fit), records=remembered, warnings=[*warnings, *([hint] if hint else [])],
-        checks={"lines": _excited(benches, [[*a, *more[k]] for k, a in enumerate(lines)])},
+        checks=_excited(benches, [[*a, *more[k]] for k, a in enumerate(lines)]),
         spectra=max(experiments, key=lambda e: abs(e.speed)).spectra, seen=[e.spectra for e in experiments],
         why=f"the excitation is periodic ({least} whole periods): maximum likelihood on period spectra",
     )  # fmt: skip
@@ -192,17 +192,18 @@ def _listed(lines: Sequence[Line]) -> str:
     return ", ".join(f"{x.frequency_hz:.4g} Hz in {x.channel}" for x in lines)
 
 
-def _excited(benches: Sequence[Record], lines: Sequence[Sequence[Line]]) -> Check:
-    """Judge lines on excited ones, where a mode between their neighbours looks alike."""
+def _excited(benches: Sequence[Record], lines: Sequence[Sequence[Line]]) -> dict[str, Check]:
+    """Judge lines on excited ones, if there are any: a mode between their neighbours looks alike."""
     on = [(b, [x for x in found if x.excited]) for b, found in zip(benches, lines, strict=True)]
     said = "; ".join(f"{_listed(found)} of {name_of(b)}" for b, found in on if found)
     if not said:
-        return Check(passed=True, detail="nothing but the excitation stands at a single excited line")
-    return Check(
+        return {}
+    check = Check(
         passed=False, cause="line", alternatives=("mode",),
         detail=f"{said} stands at a single excited line: hum, or a bending mode that the model lacks. Look for hum "
         "with the excitation off; else let modes.count be auto, or one more, and excite with lines closer together",
     )  # fmt: skip
+    return {"lines": check}
 
 
 def _from_innovations(
@@ -378,7 +379,7 @@ def _record_checks(benches: Sequence[Record], clean: Sequence[Record], rig: Rig)
     complete = Check(
         passed=not slips, cause="lost_samples" if slips else "", size=float(slips[0][1].samples) if slips else None,
         detail=f"{said}: the phase of the excitation jumps. Log without gaps, or use a part before or after" if slips
-        else "the phase of the excitation jumps nowhere, as far as it is periodic",
+        else "no phase of the excitation jumps",
     )  # fmt: skip
     return {"samples_complete": complete, **_saturation(benches, rig)}
 
