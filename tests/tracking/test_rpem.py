@@ -169,3 +169,13 @@ def test_a_speed_that_is_not_the_derivative_of_its_angle_is_refused():
     for wrong in (turning(speed_unit=2.0 * np.pi / 60.0), turning(speed_unit=9.55), turning(angle_sign=-1.0)):
         with pytest.raises(EstimationError, match="times the speed"):
             forcing_of(wrong)
+
+
+def test_a_joint_cause_of_one_number_alone_moves_nothing_together(monkeypatch):
+    r = PhysicalRpem(bearing_start(4000, 1))
+    r._joints = [np.eye(r.filter.q.size)[0]]  # the others start at zero
+    monkeypatch.setattr(type(r.drift), "risen", property(lambda drift: np.ones_like(drift.variance)))
+    before = r.filter.q.copy()
+    r.predict()
+    assert np.array_equal(r.filter.q, before)
+    sound(r)
