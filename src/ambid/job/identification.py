@@ -234,6 +234,7 @@ def _judged(
     from ambid.estimation.calibration import calibrated, lines_of
     from ambid.estimation.likelihood import innovations, simulation_error
     from ambid.validation import physical
+    from ambid.validation.facts import informed
     from ambid.validation.residuals import fit_of
 
     problem = fit.problem
@@ -279,7 +280,7 @@ def _judged(
     used, alone = None, spread.information
     if problem.model.name == "one-axis":
         facts = physical.fact_checks(fit, rig, bench, spread, robust=robust)
-        fit, spread, used = physical.informed(fit, rig, bench, facts, spread, robust=robust)
+        fit, spread, used = informed(fit, rig, bench, facts, spread, robust=robust)
         if used is not None:
             text = f"{facts['gravity_balance'].detail}. The estimate uses it"
             facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}

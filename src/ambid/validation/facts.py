@@ -12,12 +12,15 @@ Each fact is compared with the estimate in standard deviations of both; a contra
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.uncertainty import Uncertainty
 from ambid.estimation.estimate import Check
-from ambid.estimation.uncertainty import chi_squared_tail
+from ambid.estimation.likelihood import Fit, evaluate, workspace_near
+from ambid.estimation.uncertainty import chi_squared_tail, natural_sizes
 from ambid.record import Record
 from ambid.rig import Rig
 
@@ -35,6 +38,8 @@ GRAVITY = 9.81  # m/s^2
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
 _TOP = 0.2  # part of the voltage's power in the top octave, from which it may change between samples
 _SAYS, _ORDER = 0.25, 6  # part of the current's next change that a logged voltage says at least, from six samples
+_NEAR_ENOUGH, _PARABOLA = 2.5, 2.0  # sd between weight and estimate, and rise of the criterion over that of a parabola
+_LAW = 0.01  # part of a force that may not grow as the square of the current
 _PER_COIL = 2.0  # samples in a coil's time constant below which its inductance is hardly seen
 
 
@@ -245,3 +250,39 @@ def _sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: floa
         else f"sampled too slowly for the coil: L/R is {max(L / R * rate_hz, 0.0):.2g} samples, so that L is not seen. "
         f"Sample at {rate_hz * 5.0 / max(samples, 0.1):.2g} Hz or more, or fix L",
     )  # fmt: skip
+
+
+def informed(
+    fit: Fit, rig: Rig, record: Record, facts: Mapping[str, Check], spread: Uncertainty, *, robust: bool
+) -> tuple[Fit, Uncertainty, tuple[Array, Array] | None]:
+    """Let facts tell of an estimate: what one contradicts is widened by how far apart they are, and the weight moves it
+    where the rig says that one magnet carries it and both agree; then gain and h are given, (n,) each.
+
+    The weight says k_i - w m = 0 within a part s of k_i (of the law, the current's zero, as wrong as the means say, and
+    what its check counts), h = (1, -w)/(w m) over k_i and m; with covariance P of the estimate, the gain is
+    P h / (hᵀ P h + s²). The move has to be one in which the criterion is a parabola.
+    """
+    theta, names, apart = fit.problem.parameters(fit.vector), spread.names, {"R": facts["ohm"].size or 0.0}
+    weight, n = facts.get("gravity_balance"), len(spread.names)
+    if weight is not None and not weight.passed:
+        apart["k_i"] = (weight.values["expected"] - weight.values["k_i_over_m"]) * theta["m"]
+    spread = replace(spread, apart=np.array([apart.get(name, 0.0) for name in names]))
+    single = rig.magnet is not None and rig.magnet.kind == "single"
+    if weight is None or not (weight.passed and single) or "k_i" not in names:
+        return fit, spread, None
+    expected, covariance = weight.values["expected"], spread.covariance(robust=robust)
+    slope = np.array([(name == "k_i") / (expected * theta["m"]) - (name == "m") / theta["m"] for name in names])
+    seen = 0.0 if facts["ohm"].passed else facts["ohm"].values["current_offset"]
+    zero = max(offset_sd(record, "current", rig), abs(seen)) / float(record["current"].values.mean())
+    sd = float(np.linalg.norm([weight.values["expected_sd"] / expected, _LAW, zero]))
+    off, total = 1.0 - weight.values["k_i_over_m"] / expected, float(slope @ covariance @ slope + sd**2)
+    gain, vector = covariance @ slope / total, fit.vector.copy()
+    step = gain * off / fit.problem.magnitude
+    vector[:n] += step
+    predicted = float(step @ np.linalg.pinv(spread.information / np.outer(*(fit.problem.magnitude,) * 2)) @ step)
+    rise = evaluate(fit.problem, vector, workspace_near(fit, fit.problem))[0] - fit.criterion
+    if abs(off) > _NEAR_ENOUGH * np.sqrt(total) or not rise < _PARABOLA * predicted + 1.0:
+        return fit, spread, None
+    moved = fit.problem.parameters(vector)
+    scale = natural_sizes(names, moved, fit.problem.model.references(moved))
+    return replace(fit, vector=vector), spread.weighed(gain, slope, sd, scale), (gain, slope)

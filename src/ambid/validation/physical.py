@@ -25,7 +25,6 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import (
     Fit,
     Products,
-    evaluate,
     extend,
     free_one,
     products,
@@ -35,13 +34,13 @@ from ambid.estimation.likelihood import (
     workspace_near,
 )
 from ambid.estimation.linear import column_sizes, directions
-from ambid.estimation.uncertainty import chi_squared_tail, natural_sizes, p_text
+from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.rig.rig import Rig, RigMagnet
 from ambid.signals.faults import Dropouts, Saturation, find_dropouts, find_outliers, find_saturation, resolution
 from ambid.simulation.plant import closed_loop_poles
-from ambid.validation.facts import GRAVITY, agreements, offset_sd, one_sided
+from ambid.validation.facts import GRAVITY, agreements, one_sided
 from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check, white_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
@@ -450,8 +449,6 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
 _NEAR = 0.3  # relative, up to which a calibration may explain it
 _COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
-_NEAR_ENOUGH, _PARABOLA = 2.5, 2.0  # sd between weight and estimate, and rise of the criterion over that of a parabola
-_LAW = 0.01  # part of a force that may not grow as the square of the current
 _EVEN = 0.02  # change of a known disturbance within a sample of a refit, over its size
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
@@ -494,42 +491,6 @@ def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robus
                 "k_x > 0. Check that all columns are of one run, and their signs",
             )  # fmt: skip
     return checks
-
-
-def informed(
-    fit: Fit, rig: Rig, record: Record, facts: Mapping[str, Check], spread: Uncertainty, *, robust: bool
-) -> tuple[Fit, Uncertainty, tuple[Array, Array] | None]:
-    """Let facts tell of an estimate: what one contradicts is widened by how far apart they are, and the weight moves it
-    where the rig says that one magnet carries it and both agree; then gain and h are given, (n,) each.
-
-    The weight says k_i - w m = 0 within a part s of k_i (of the law, the current's zero, as wrong as the means say, and
-    what its check counts), h = (1, -w)/(w m) over k_i and m; with covariance P of the estimate, the gain is
-    P h / (hᵀ P h + s²). The move has to be one in which the criterion is a parabola.
-    """
-    theta, names, apart = fit.problem.parameters(fit.vector), spread.names, {"R": facts["ohm"].size or 0.0}
-    weight, n = facts.get("gravity_balance"), len(spread.names)
-    if weight is not None and not weight.passed:
-        apart["k_i"] = (weight.values["expected"] - weight.values["k_i_over_m"]) * theta["m"]
-    spread = replace(spread, apart=np.array([apart.get(name, 0.0) for name in names]))
-    single = rig.magnet is not None and rig.magnet.kind == "single"
-    if weight is None or not (weight.passed and single) or "k_i" not in names:
-        return fit, spread, None
-    expected, covariance = weight.values["expected"], spread.covariance(robust=robust)
-    slope = np.array([(name == "k_i") / (expected * theta["m"]) - (name == "m") / theta["m"] for name in names])
-    seen = 0.0 if facts["ohm"].passed else facts["ohm"].values["current_offset"]
-    zero = max(offset_sd(record, "current", rig), abs(seen)) / float(record["current"].values.mean())
-    sd = float(np.linalg.norm([weight.values["expected_sd"] / expected, _LAW, zero]))
-    off, total = 1.0 - weight.values["k_i_over_m"] / expected, float(slope @ covariance @ slope + sd**2)
-    gain, vector = covariance @ slope / total, fit.vector.copy()
-    step = gain * off / fit.problem.magnitude
-    vector[:n] += step
-    predicted = float(step @ np.linalg.pinv(spread.information / np.outer(*(fit.problem.magnitude,) * 2)) @ step)
-    rise = evaluate(fit.problem, vector, workspace_near(fit, fit.problem))[0] - fit.criterion
-    if abs(off) > _NEAR_ENOUGH * np.sqrt(total) or not rise < _PARABOLA * predicted + 1.0:
-        return fit, spread, None
-    moved = fit.problem.parameters(vector)
-    scale = natural_sizes(names, moved, fit.problem.model.references(moved))
-    return replace(fit, vector=vector), spread.weighed(gain, slope, sd, scale), (gain, slope)
 
 
 def _resolution(record: Record, fit: Fit) -> Check:
