@@ -216,8 +216,9 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
             break
         fit, taken = more
         estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
-        agree = {k: first.checks[k] for k, c in estimate.checks.items() if c.values.get("refits") == 0.0}
-        checks = {**estimate.checks, **agree}  # where no refit was possible, that without the causes counts
+        checks, agree = dict(estimate.checks), estimate.checks["estimates_agree"]
+        if agree.passed and not agree.values["refits"]:  # none was possible: those without the causes count
+            checks["estimates_agree"] = first.checks["estimates_agree"]
         estimate = replace(estimate, checks=checks, extended=tuple(dict.fromkeys(told(c) for c in taken)))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
     return estimate if after < before and not after & _OF_THE_MODEL else first
