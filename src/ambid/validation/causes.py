@@ -137,8 +137,7 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
     if lines:
-        waves = [(line.channel, wave) for line in lines for wave in waves_at(line.k, course.t.size).T]
-        groups.append(("line", tuple((wave,) for wave in waves)))
+        groups.append(("line", tuple(((x.channel, w),) for x in lines for w in waves_at(x.k, course.t.size).T)))
     found = _tested(look, groups)
     if lines:
         found[-1] = replace(found[-1], size=lines[0].k * rate_hz / course.t.size, p=min(found[-1].p, lines[0].p))

@@ -440,10 +440,8 @@ def _feedback(residuals: Residuals, *, slow: bool = False) -> ResidualTest:
     if slow:
         from scipy.signal import lfilter
 
-        loop, past_errors = (
-            (1,),
-            [np.hstack([lfilter([1.0], [1.0, -k], x, axis=0) for k in _MEMORY]) for x in past_errors],
-        )
+        loop = (1,)
+        past_errors = [np.hstack([lfilter([1.0], [1.0, -k], x, axis=0) for k in _MEMORY]) for x in residuals.e]
     errors = np.concatenate([_rows(e, loop, k) for e, k in zip(past_errors, start, strict=True)])
     now = np.concatenate([u[k:] for u, k in zip(residuals.u, start, strict=True)])
     left = now - past @ np.linalg.lstsq(past, now, rcond=None)[0] if slow else now  # as of a periodic input
