@@ -22,6 +22,7 @@ pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason=ABSENT)
 MASS, GRAVITY, RESISTANCE = 0.06054, 9.81, 4.17
 LEVITATION = ("stairs_a", "stairs_b", "updown_c", "sine_d", "sine_e")
 COIL = ("1", "2", "3", "4", "20mm")
+SETS = {"four records": (("updown_c", "sine_d"), ("1", "20mm")), "ten records": (LEVITATION, COIL)}
 RIG = """schema = "ambid.rig/1"
 name = "maglev, upper coil"
 model = "one-axis"
@@ -60,12 +61,13 @@ def over_all(rig):
     )
 
 
-@pytest.fixture(scope="module")
-def files(rig, tmp_path_factory):
-    """What the command of docs/nonlinear_bearing.md writes."""
+@pytest.fixture(scope="module", params=SETS)
+def files(rig, tmp_path_factory, request):
+    """What the command of docs/nonlinear_bearing.md writes, of two records of each kind and of all."""
     at = tmp_path_factory.mktemp("estimate")
-    words = ["identify", *(MAGLEV / f"levitate_{n}.csv" for n in LEVITATION), "--rig", rig, "--nonlinear"]
-    for n in COIL:
+    levitation, coil = SETS[request.param]
+    words = ["identify", *(MAGLEV / f"levitate_{n}.csv" for n in levitation), "--rig", rig, "--nonlinear"]
+    for n in coil:
         words += ["--held", MAGLEV / f"coil_steps_{n}.csv"]
     assert run([str(w) for w in (*words, "--json", at / "ball.json", "--plot", at / "ball.png")]) == 0
     return at

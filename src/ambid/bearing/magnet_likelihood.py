@@ -351,7 +351,8 @@ class BearingUncertainty:
     robust: Array
     delay_sd: dict[float, float]  # by rate, in samples, where it was estimated
     inflation: float  # largest ratio of robust to information standard deviation
-    # (n,), SI, how far numbers move beyond chance where the records are used otherwise; part of the robust covariance
+    # (n_moves, n), SI, how far numbers move beyond chance where the records are used otherwise; part of the robust
+    # covariance
     disagreement: Array
 
     def covariance(self, *, robust: bool) -> Array:
@@ -360,7 +361,11 @@ class BearingUncertainty:
             return self.information
         ratio = np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.robust), 1e-300))
         wider = np.maximum(ratio, 1.0)
-        return np.asarray(self.robust * np.outer(wider, wider) + np.outer(self.disagreement, self.disagreement))
+        # every direction in which they move, each number by no more than it moves at most
+        moves = self.disagreement.T @ self.disagreement
+        largest = np.max(np.abs(self.disagreement), axis=0, initial=0.0)
+        part = largest / np.sqrt(np.maximum(np.diag(moves), 1e-300))
+        return np.asarray(self.robust * np.outer(wider, wider) + moves * np.outer(part, part))
 
 
 def uncertainty(fit: BearingFit) -> BearingUncertainty:
@@ -390,5 +395,5 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
         robust=wide,
         delay_sd=dict(zip(problem.rates, extra, strict=True)),
         inflation=float(ratio.max()),
-        disagreement=np.zeros(n),
+        disagreement=np.zeros((0, n)),
     )

@@ -267,9 +267,7 @@ def judge_bearing(
     robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
     if robust:
         others = agreement(fit, spread, alone=False)
-        shift, sd = np.vstack([alone.shift, others.shift]), np.vstack([alone.sd, others.sd])
-        both = replace(alone, shift=shift, sd=sd)
-        spread = replace(spread, disagreement=both.beyond_chance())
+        spread = replace(spread, disagreement=np.vstack([x.beyond_chance() for x in (alone, others)]))
     parameters = _parameters(fit, spread, robust=robust)
     checks = {**residuals, "identifiable": _shown(parameters)} | _gravity(fit)
     noise = {

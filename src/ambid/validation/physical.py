@@ -86,10 +86,8 @@ class Agreement:
         return (bool(self.strides) or self.fast) and self.largest < _MOST
 
     def beyond_chance(self) -> Array:
-        """Return how far each parameter (n,), SI, moves beyond chance in the refit that is least likely for it."""
-        away = np.sign(self.shift) * np.sqrt(np.maximum(self.shift**2 - self.sd**2, 0.0))
-        least = np.argmax(np.abs(self.shift / self.sd), axis=0) if len(away) else []
-        return np.asarray([away[k, j] for j, k in enumerate(least)] or np.zeros(len(self.names)))
+        """Return how far each parameter moves beyond chance in each refit, (n_refits, n), SI."""
+        return np.asarray(np.sign(self.shift) * np.sqrt(np.maximum(self.shift**2 - self.sd**2, 0.0)))
 
     def disagreement(self) -> Array:
         """Return how far parameters (n,), SI, move in the refit in which they move most; zeros where none converged."""

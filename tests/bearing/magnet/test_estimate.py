@@ -31,6 +31,17 @@ def bearing():
     return done, truth, fit
 
 
+def test_disagreement_widens_each_direction_in_which_records_move_the_numbers(bearing):
+    known = uncertainty(bearing[2])
+    one, other = np.zeros((2, 7))
+    one[:2], other[:2] = (3.0, 2.0), (3.0, -1.0)
+    plain = known.covariance(robust=True)
+    extra = replace(known, disagreement=np.array([one, other])).covariance(robust=True) - plain
+    assert np.diag(extra)[:3] == pytest.approx([9.0, 4.0, 0.0])
+    assert np.linalg.eigvalsh(extra[:2, :2]).min() > 1.0  # one move alone would leave a combination as it was
+    assert not np.any(replace(known, disagreement=np.zeros((3, 7))).covariance(robust=True) - plain)
+
+
 def test_numbers_are_right_within_one_percent_and_within_their_deviations(bearing):
     done, truth, fit = bearing
     assert all(d.within_limits or d.first_contact is None for d in done)
@@ -38,6 +49,7 @@ def test_numbers_are_right_within_one_percent_and_within_their_deviations(bearin
     assert fit.status == "converged"
     known, values = uncertainty(fit), fit.problem.values(fit.vector)
     assert known.names == ("k", "s", "L_leak", "m", "R", "x_offset", "v_offset")
+    assert known.disagreement.shape == (0, 7)
     for name, sd in zip(known.names, np.sqrt(np.diag(known.information)), strict=True):
         assert abs(values[name] - truth[name]) < 3.7 * sd, name
     for name in ("k", "s", "m", "R"):
