@@ -201,6 +201,7 @@ def test_a_leakage_that_is_none_is_judged_by_what_it_moves():
 def contradicting():
     """Estimates from two records each, at two gaps, by a law without the saturation that the bench has."""
     true, told = ball(sigma=0.3)
+    told = replace(told, magnet=replace(told.magnet, saturation=False))
     found = []
     for seed in range(3):
         places = enumerate((0.008, 0.012))
@@ -209,6 +210,22 @@ def contradicting():
         ]
         found.append(identify_nonlinear(records, told))
     return true, found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_saturation_is_found_in_one_record_at_one_gap(seed):
+    """Without it the residuals are white in two of these records, and k_i, which the weight then fixes to a part in ten
+    thousand, is six per cent off. The first 4000 samples do not show it."""
+    true, told = ball(sigma=0.3)
+    found = identify_nonlinear(package.simulate(true, duration=3.0, seed=seed, nonlinear=True, position=0.01), told)
+    law = plant_of_rig(true).magnet
+    assert found.law.saturation
+    assert not found.law.rise
+    x = found.operating_point["position"]
+    i = law.holding_current(x, 0.06 * 9.81)
+    at = found.curves(x, i)
+    for curve, truth in ((at.k_x, law.displacement_coefficient(x, i)), (at.k_i, law.force_per_current(x, i))):
+        assert abs(curve.value[0] - truth) < 3.5 * curve.sd[0]
 
 
 def test_records_that_contradict_each_other_are_told_and_their_intervals_hold_the_truth(contradicting):

@@ -10,8 +10,9 @@ x/zeta; for a pair k_i = 2 k i0/s^2 and k_x = -2 k i0^2/s^3 (theory.md sec. 1, k
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -35,8 +36,11 @@ _SHORT = 12  # iterations with which a whole delay is tried
 _TRIED = 15  # iterations with which laws are compared
 _LONG = 30  # iterations with which a richer law is
 _HINT = 1e-3  # of the leakage: how much it rises where only its promise is asked
+_SATURATES = 0.2  # of the start value of sigma, likewise
 _KNEES = (0.4, 1.0, 3.0)  # times the knee at which a search begins
-_LIKELY = 0.5  # share of its price that a rising leakage must promise to be searched
+_LIKELY = 0.5  # share of its price that a part of the law must promise to be searched
+PARTS = {"asymmetric": ("k_asym", "i0_asym"), "rise": ("L_rise", "i_knee"), "saturation": ("sigma",)}
+"""Parts that a law may have, with their numbers."""
 _STRETCH = 4000  # samples of each record on which laws are compared
 _FAR, _CLOSE = 1e-3, 1e-9  # damping with which the search over all samples begins
 _LONGER = 64000  # samples of each record on which the search goes on, where there are many more
@@ -48,7 +52,8 @@ def estimate_bearing(
     *,
     laws: Sequence[MagnetLaw],
     delay: float | None = None,
-    extend: bool = True,
+    extend: Sequence[str] = tuple(PARTS),
+    white: Callable[[BearingFit], bool] | None = None,
     eddy: bool = False,
     drift: bool = False,
     tick: Tick | None = None,
@@ -56,9 +61,10 @@ def estimate_bearing(
     seed: int = 0,
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several `records`, at least one of a free rotor. `laws`: the likelihood
-    chooses; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force behind a pole a/(s + a);
-    `drift`: a slowly walking force, what the law leaves over; `seed`: of the global search, told by the fit's
-    `global_search`; a KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
+    chooses; `extend`: parts that they may take on (BIC), saturation only with residuals that are `white`, or it would
+    take up any misfit; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force behind a pole
+    a/(s + a); `drift`: a slowly walking force, what the law leaves over; `seed`: of the global search, told by the
+    fit's `global_search`; a KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
     """
     free = [r for r in records if not r.held]
     if not free:
@@ -66,11 +72,11 @@ def estimate_bearing(
     laws = [_widened(law, parameters) for law in laws]
     short = [_short(r) for r in records]
     few, many = (float(sum(r.u.size for r in x)) for x in (short, records))
-    rich = extend and any(not law.rise or (law.pair and not law.asymmetric) for law in laws)
+    shown_soon = [n for n in ("asymmetric", "rise") if n in extend and (laws[0].pair or n != "asymmetric")]
     again = _remembered(tick)
     longer = tuple(r.first(_LONGER) for r in records)
     some = float(sum(r.u.size for r in longer)) * (max(r.u.size for r in records) > 2 * _LONGER)
-    ticks = portions(again, [*[few] * len(laws), 2.0 * few * rich, some, many, many * (delay is None)])
+    ticks = portions(again, [*[few] * len(laws), 2.0 * few * bool(shown_soon), some, many, many * (delay is None)])
     with one_thread():
         linear = linear_start(free[0], parameters, delay, laws[0])
         fits = [
@@ -78,17 +84,16 @@ def estimate_bearing(
             for law, t in zip(laws, ticks, strict=False)
         ]
         fit = min(fits, key=lambda f: f.criterion)
-        if extend and fit.status != "failed":
-            for name in ("asymmetric", "rise") if fit.problem.law.pair else ("rise",):
-                law = replace(fit.problem.law, rise=fit.problem.law.rise or name == "rise",
-                              asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
-                if law != fit.problem.law:
-                    fit = _extended(fit, law, parameters, short, linear, ticks[-4])
+        for part in shown_soon:
+            fit = _extended(fit, part, parameters, short, linear, ticks[-4])
         whole, near = replace(fit.problem, records=tuple(records)), _FAR
         if some:  # a step or two over all samples will do from there
             fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
             near = _CLOSE if fit.status == "converged" else _FAR
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
+        if "saturation" in extend:
+            richer = _extended(fit, "saturation", parameters, short, linear, again)
+            fit = richer if white is None or white(richer) else fit
         fit = rescue(
             fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
             lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
@@ -100,9 +105,15 @@ def estimate_bearing(
 
 
 def _widened(law: MagnetLaw, parameters: Mapping[str, Parameter]) -> MagnetLaw:
-    """The law with what the user says of a difference between the magnets of a pair."""
-    own = [parameters[n] for n in ("k_asym", "i0_asym") if n in parameters]
-    return replace(law, asymmetric=law.pair and (law.asymmetric or any(p.role != "fixed" or p.value for p in own)))
+    """The law with the parts of which the user says a number."""
+    own = {
+        part: any(n in parameters and (parameters[n].role != "fixed" or parameters[n].value) for n in names)
+        for part, names in PARTS.items()
+    }
+    return replace(
+        law, asymmetric=law.pair and (law.asymmetric or own["asymmetric"]), rise=law.rise or own["rise"],
+        saturation=law.saturation or own["saturation"],
+    )  # fmt: skip
 
 
 def _remembered(tick: Tick | None) -> Tick:
@@ -158,43 +169,49 @@ def _with_eddy(numbers: tuple[Number, ...], parameters: Mapping[str, Parameter],
 
 
 def _extended(
-    fit: BearingFit, law: MagnetLaw, parameters: Mapping[str, Parameter], records: Sequence[BearingRecord],
+    fit: BearingFit, part: str, parameters: Mapping[str, Parameter], records: Sequence[BearingRecord],
     linear: LinearStart, tick: Tick | None,
 ) -> BearingFit:  # fmt: skip
-    """The fit with a richer law where it pays (BIC)."""
+    """The fit with one part more of its law where it pays (BIC)."""
+    if getattr(fit.problem.law, part) or fit.status == "failed":
+        return fit
     if fit.status == "stalled":  # else the richer law would be paid for going on
         fit = search(fit.problem, fit.vector, iterations=_LONG, tick=tick)
-    values, old = fit.problem.values(fit.vector), {n.name: n for n in fit.problem.numbers}
+    more: dict[str, Any] = {part: True}
+    law, values = replace(fit.problem.law, **more), dict(fit.problem.values(fit.vector))
     fresh = {n.name: n for n in start_numbers(law, parameters, records, linear)}
-    new = [n for n in law.names if fresh[n].estimated and not old[n].estimated]
-    if not new:
-        return fit
+    new = [n for n in PARTS[part] if fresh[n].estimated]
     if "L_rise" in new:
         values |= {"L_leak": 0.7 * values["L_leak"], "L_rise": 0.4 * values["L_leak"]}
+        fresh["L_rise"] = replace(fresh["L_rise"], value=values["L_rise"])
     numbers = tuple(
         fresh[n.name] if n.name in new
         else n if not n.estimated or np.isfinite(n.prior_sd) else replace(n, value=values[n.name])
         for n in fit.problem.numbers
     )  # fmt: skip
-    if "L_rise" in new:
-        numbers = tuple(replace(n, value=values["L_rise"]) if n.name == "L_rise" else n for n in numbers)
     problem, price = replace(fit.problem, law=law, numbers=numbers), len(new) * float(np.log(fit.problem.n_used))
-    if "L_rise" in new and fit.status == "converged" and not _rises(fit, problem, _LIKELY * price):
+    if part != "asymmetric" and fit.status == "converged" and not _promises(fit, problem, _LIKELY * price):
         return fit
     richer = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
     return richer if fit.criterion - richer.criterion > price else fit
 
 
-def _rises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:
-    """Whether a hint of a rising leakage promises enough, at any of a few knees (score test: a search takes longer)."""
+def _promises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:
+    """Whether a hint of a rising leakage (at any of a few knees) or of saturation promises enough (score test: a search
+    takes longer).
+    """
     names, start = [n.name for n in problem.estimated], _carried(fit, problem)
-    if not {"L_leak", "L_rise"} <= set(names):
+    if problem.law.saturation and not fit.problem.law.saturation:
+        start[names.index("sigma")] += np.log(_SATURATES)
+    elif not {"L_leak", "L_rise"} <= set(names):
         return True
-    leak = fit.problem.values(fit.vector)["L_leak"]
-    start[names.index("L_leak")], start[names.index("L_rise")] = np.log(leak), np.log(_HINT * leak)
-    for share in _KNEES if "i_knee" in names else (1.0,):
+    else:
+        leak = fit.problem.values(fit.vector)["L_leak"]
+        start[names.index("L_leak")], start[names.index("L_rise")] = np.log(leak), np.log(_HINT * leak)
+    knee = "i_knee" in names and not fit.problem.law.rise
+    for share in _KNEES if knee else (1.0,):
         hinted = start.copy()
-        if "i_knee" in names:
+        if knee:
             hinted[names.index("i_knee")] += np.log(share)
         at = linearise(problem, hinted)
         if at is None or promise(at) > least:

@@ -370,7 +370,7 @@ def identify_nonlinear(
     from ambid.bearing.magnet_estimate import estimate_bearing
     from ambid.bearing.magnet_likelihood import uncertainty
     from ambid.job.nonlinear_bearing import BearingWords, bearing_rig, judge_bearing, laws_of, numbers_of, take_all
-    from ambid.validation.nonlinear_bearing import validation
+    from ambid.validation.nonlinear_bearing import validation, white
 
     words = BearingWords(
         eddy=eddy, drift=drift, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout,
@@ -383,7 +383,7 @@ def identify_nonlinear(
     wanted = bench.channel("voltage").delay
     fit = estimate_bearing(
         [t.record for t in readings], numbers_of(bench), laws=laws, delay=None if wanted == "auto" else float(wanted),
-        extend=extend, eddy=bench.magnet.eddy, drift=bench.magnet.drift, tick=say,
+        extend=extend, white=white, eddy=bench.magnet.eddy, drift=bench.magnet.drift, tick=say,
     )  # fmt: skip
     if fit.status == "failed":
         raise EstimationError(

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from ambid.arrays import Array
+from ambid.bearing.magnet_estimate import PARTS
 from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, BearingRecord, touching, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
@@ -79,9 +80,9 @@ def numbers_of(rig: Rig) -> dict[str, Parameter]:
     return {**{n: rig.parameter(n) for n in _LINEAR}, **{p.name: p for p in rig.magnet.parameters}}
 
 
-def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], bool]:
-    """Return the laws between which the likelihood of moving rotors' `records` decides, and `extend`: whether to try a
-    rising leakage, and unequal magnets of a pair.
+def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], list[str]]:
+    """Return the laws between which the likelihood of moving rotors' `records` decides, and the parts that it may add
+    to them, since the rig says nothing of them.
     """
     kind = magnet.kind
     if kind == "auto" and magnet.gap == "exponential":
@@ -89,15 +90,15 @@ def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[M
     if kind == "auto" and records:
         low, high = min(r.kept[:, 1].min() for r in records), max(r.kept[:, 1].max() for r in records)
         kind = "pair" if low < -_REVERSED * high else "single"
-    rise, pair = bool(magnet.rise), kind == "pair"
+    pair, rise, saturation = kind == "pair", bool(magnet.rise), bool(magnet.saturation)
     gaps: tuple[Literal["hyperbolic", "exponential"], ...] = ("hyperbolic", "exponential")
     if magnet.gap or pair:
         gaps = (magnet.gap or "hyperbolic",)
     laws = [
-        MagnetLaw(gap=gap, pair=pair, asymmetric=bool(magnet.asymmetric), saturation=magnet.saturation, rise=rise)
+        MagnetLaw(gap=gap, pair=pair, asymmetric=bool(magnet.asymmetric), saturation=saturation, rise=rise)
         for gap in gaps
     ]
-    return laws, magnet.rise is None and magnet.asymmetric is None
+    return laws, [part for part in PARTS if getattr(magnet, part) is None]
 
 
 def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:

@@ -262,7 +262,7 @@ def _rig_of_rotor(bench: Preset, body: RotorBody) -> Rig:
         unbalance=body.unbalance,
         runout=body.runout,
         magnet=RigMagnet(
-            kind="pair", gap="hyperbolic", saturation=body.sigma != 0.0, cone=body.cone,
+            kind="pair", gap="hyperbolic", saturation=True if body.sigma else None, cone=body.cone,
             parameters=tuple(Parameter(name=n, unit=specs[n].unit, value=x, role="fixed") for n, x in numbers.items()),
         ),
         loop=bench.loop,

@@ -154,8 +154,8 @@ class RigMagnet:
         Gap law of one magnet; None: the records decide.
     asymmetric : bool or None
         Whether the magnets of a pair may differ in strength and bias (k_asym, i0_asym); None: the records decide.
-    saturation : bool
-        Whether the iron may saturate (sigma).
+    saturation : bool or None
+        Whether the iron may saturate (sigma); None: the records decide.
     rise : bool or None
         Whether the leakage inductance may rise with the current; None: the records decide.
     eddy, drift : bool
@@ -171,7 +171,7 @@ class RigMagnet:
     kind: Literal["auto", "single", "pair"] = "auto"
     gap: Literal["hyperbolic", "exponential"] | None = None
     asymmetric: bool | None = None
-    saturation: bool = False
+    saturation: bool | None = None
     rise: bool | None = None
     eddy: bool = False
     drift: bool = False
@@ -190,7 +190,7 @@ class RigMagnet:
             f"kind = {self.kind!r}": ("L_g", "zeta") if self.kind == "pair" else ("i0", "k_asym", "i0_asym"),
             f"gap = {self.gap!r}": ("k", "s") if self.gap == "exponential" else ("L_g", "zeta") if self.gap else (),
             "asymmetric = false": ("k_asym", "i0_asym") if self.asymmetric is False else (),
-            "saturation = false": () if self.saturation else ("sigma",),
+            "saturation = false": ("sigma",) if self.saturation is False else (),
             "rise = false": ("L_rise", "i_knee") if self.rise is False else (),
             "eddy = false": () if self.eddy else ("a",),
         }
@@ -550,14 +550,8 @@ def _mode_lines(numbers: Mapping[str, float], n: int) -> list[str]:
 def _magnet_lines(magnet: RigMagnet) -> list[str]:
     lines = ["[magnet]", f'kind = "{magnet.kind}"']
     lines += [f'gap = "{magnet.gap}"'] if magnet.gap else []
-    switches = {
-        "asymmetric": magnet.asymmetric,
-        "saturation": magnet.saturation,
-        "eddy": magnet.eddy,
-        "drift": magnet.drift,
-    }
-    lines += [f"{name} = true" for name, on in switches.items() if on]
-    choices = {"asymmetric": magnet.asymmetric, "rise": magnet.rise}
+    lines += [f"{name} = true" for name, on in (("eddy", magnet.eddy), ("drift", magnet.drift)) if on]
+    choices = {"asymmetric": magnet.asymmetric, "saturation": magnet.saturation, "rise": magnet.rise}
     lines += [f"{name} = {str(on).lower()}" for name, on in choices.items() if on is not None]
     lines += [] if magnet.off_below is None else [f"off_below = {magnet.off_below!r}"]
     lines += [f"cone = {magnet.cone!r}"] if magnet.cone else []

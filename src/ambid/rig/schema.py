@@ -188,7 +188,7 @@ class MagnetEntry(_Entry):
     kind: Literal["auto", "single", "pair"] = "auto"
     gap: Literal["hyperbolic", "exponential"] | None = None
     asymmetric: Annotated[bool, Field(strict=True)] | None = None
-    saturation: Annotated[bool, Field(strict=True)] = False
+    saturation: Annotated[bool, Field(strict=True)] | None = None
     rise: Annotated[bool, Field(strict=True)] | None = None
     eddy: Annotated[bool, Field(strict=True)] = False
     drift: Annotated[bool, Field(strict=True)] = False

@@ -52,7 +52,7 @@ def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
             "kind = 'single' or 'pair'"
         )
     law = MagnetLaw(
-        gap=magnet.gap or "hyperbolic", pair=kind == "pair", saturation=magnet.saturation,
+        gap=magnet.gap or "hyperbolic", pair=kind == "pair", saturation=_has(magnet, magnet.saturation, ("sigma",)),
         rise=_has(magnet, magnet.rise, ("L_rise", "i_knee")),
         asymmetric=_has(magnet, magnet.asymmetric, ("k_asym", "i0_asym")),
     )  # fmt: skip

@@ -79,6 +79,11 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     )  # fmt: skip
 
 
+def white(fit: BearingFit) -> bool:
+    """Whether the innovations of every record pass `whiteness`."""
+    return all(whiteness(fit, r).p >= P_LEAST for r in range(len(fit.problem.records)))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BearingReplay:
     """A record run through an estimate, SI units."""

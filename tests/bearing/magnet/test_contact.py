@@ -76,7 +76,7 @@ def test_a_long_record_with_touches_is_identified_from_its_beginning_on():
     known = {n: Parameter(name=n, unit="1", role="fixed", value=TRUTH[n]) for n in ("m", "c")}  # m in kg, c in N s/m
     known["R"] = Parameter(name="R", unit="ohm")
     # more samples than those on which laws are compared
-    right(estimate_bearing([touching(lying(5, 6000), STOPS)], known, laws=[LAW], delay=0.0, extend=False))
+    right(estimate_bearing([touching(lying(5, 6000), STOPS)], known, laws=[LAW], delay=0.0, extend=()))
 
 
 def test_the_impulse_of_the_force_is_that_of_the_weight_and_the_momentum(rests):

@@ -27,7 +27,7 @@ PAIR = MagnetLaw(pair=True)
 @pytest.fixture(scope="module")
 def bearing():
     done, truth = unstable(6000, range(2), STRONG)
-    fit = estimate_bearing([as_seen(d, str(n)) for n, d in enumerate(done)], KNOWN, laws=[PAIR], extend=False)
+    fit = estimate_bearing([as_seen(d, str(n)) for n, d in enumerate(done)], KNOWN, laws=[PAIR], extend=())
     return done, truth, fit
 
 
@@ -71,7 +71,7 @@ def test_a_search_over_a_stretch_first_ends_where_one_over_all_samples_does(bear
     seen = []
     monkeypatch.setattr(magnet_estimate, "_LONGER", 2000)
     monkeypatch.setattr(magnet_estimate, "search", lambda *a, **k: seen.append(search(*a, **k)) or seen[-1])
-    again = estimate_bearing([as_seen(d, str(n)) for n, d in enumerate(done)], KNOWN, laws=[PAIR], extend=False)
+    again = estimate_bearing([as_seen(d, str(n)) for n, d in enumerate(done)], KNOWN, laws=[PAIR], extend=())
     assert [f.problem.records[0].u.size for f in seen] == [4000, 2000, 6000]
     assert seen[-1].evaluations <= 3
     sd = np.sqrt(np.diag(np.linalg.inv(fit.at.J.T @ fit.at.J)))
@@ -149,4 +149,4 @@ def test_the_balance_gives_the_gap_law_back(bearing, gap):
 def test_a_turned_sign_is_refused(bearing):
     seen = as_seen(bearing[0][0])
     with pytest.raises(EstimationError, match="sign"):
-        estimate_bearing([seen], KNOWN, laws=[MagnetLaw()], extend=False)
+        estimate_bearing([seen], KNOWN, laws=[MagnetLaw()], extend=())

@@ -56,13 +56,13 @@ def noisy():
 
 @pytest.fixture(scope="module")
 def before(noisy):
-    return estimate_bearing([noisy], KNOWN, laws=[LAW], extend=False, evaluations=0)
+    return estimate_bearing([noisy], KNOWN, laws=[LAW], extend=(), evaluations=0)
 
 
 def test_a_better_minimum_is_found_where_no_search_converges(noisy, before):
     assert before.status == "stalled"
     assert failure(before) == "no search converged"
-    fit = estimate_bearing([noisy], KNOWN, laws=[LAW], extend=False)
+    fit = estimate_bearing([noisy], KNOWN, laws=[LAW], extend=())
     assert fit.global_search is not None
     told = fit.global_search
     assert told["taken"]
@@ -79,7 +79,7 @@ def test_a_better_minimum_is_found_where_no_search_converges(noisy, before):
 def test_what_is_hardly_better_is_not_taken():
     # the delay is 1; in such noise other delays do as well, with other numbers
     record = ball(1500, 3, swing=0.0, louder=30.0)
-    fit = estimate_bearing([record], KNOWN, laws=[LAW], extend=False)
+    fit = estimate_bearing([record], KNOWN, laws=[LAW], extend=())
     assert fit.global_search is not None
     assert not fit.global_search["taken"]
     assert fit.problem.delays == {2000.0: 1.0}
@@ -88,7 +88,7 @@ def test_what_is_hardly_better_is_not_taken():
 def test_a_sign_that_is_lost_in_the_noise_does_not_end_the_estimate():
     known = {**KNOWN, "R": fixed("R", "ohm")}
     fit = estimate_bearing(
-        [ball(2000, 1, swing=2e-3, louder=400.0)], known, laws=[LAW], extend=False, delay=1.0, evaluations=0
+        [ball(2000, 1, swing=2e-3, louder=400.0)], known, laws=[LAW], extend=(), delay=1.0, evaluations=0
     )
     assert fit.status == "converged"
     assert max(shifts(fit).values()) < 3.5
@@ -100,7 +100,7 @@ def test_it_is_not_called_where_the_ordinary_start_works(monkeypatch):
         raise AssertionError("a global search where none is needed")
 
     monkeypatch.setattr(rescue, "bearing_cost", refuse)
-    one = estimate_bearing([ball(1500, 1, swing=0.0, louder=1.0)], KNOWN, laws=[LAW], extend=False)
+    one = estimate_bearing([ball(1500, 1, swing=0.0, louder=1.0)], KNOWN, laws=[LAW], extend=())
     done, _ = unstable(1500, range(1), LARGE)
     pair = {
         "m": Parameter(name="m", unit="kg"),
@@ -108,7 +108,7 @@ def test_it_is_not_called_where_the_ordinary_start_works(monkeypatch):
         "c": fixed("c", "N s/m"),
         "i0": Parameter(name="i0", unit="A", role="fixed", value=1.0),
     }
-    two = estimate_bearing([as_seen(done[0])], pair, laws=[MagnetLaw(pair=True)], extend=False)
+    two = estimate_bearing([as_seen(done[0])], pair, laws=[MagnetLaw(pair=True)], extend=())
     for fit in (one, two):
         assert fit.status == "converged"
         assert fit.global_search is None
@@ -131,7 +131,7 @@ def test_an_interruption_keeps_the_best_so_far(noisy, before):
         if seen.count("global search") > 200:
             raise KeyboardInterrupt
 
-    fit = estimate_bearing([noisy], KNOWN, laws=[LAW], extend=False, tick=tick)
+    fit = estimate_bearing([noisy], KNOWN, laws=[LAW], extend=(), tick=tick)
     assert fit.global_search is not None
     assert fit.status == "stalled"
     assert fit.global_search["interrupted"]
@@ -143,6 +143,6 @@ def test_an_interruption_before_it_leaves_it_out(noisy):
     def tick(stage, done=None, /):
         raise KeyboardInterrupt
 
-    fit = estimate_bearing([noisy], KNOWN, laws=[LAW], extend=False, tick=tick)
+    fit = estimate_bearing([noisy], KNOWN, laws=[LAW], extend=(), tick=tick)
     assert fit.status == "stalled"
     assert fit.global_search is None

@@ -65,7 +65,7 @@ def unequal():
 
 def test_unequal_magnets_are_found_without_being_asked_for(unequal):
     b, record = unequal
-    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=True)
+    fit = estimate_bearing([record], KNOWN, laws=[EQUAL])
     assert fit.problem.law == UNEQUAL
     right(fit, truth(b), {**BARS, "k_asym": 0.1, "i0_asym": 0.03})
     assert whiteness(fit, 0).p > 1e-3
@@ -82,14 +82,14 @@ def test_an_equal_law_on_unequal_magnets_shows(unequal):
 
 def test_equal_magnets_stay_equal():
     record = seen(bench(), 4000)
-    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=True, delay=1.0)
+    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], delay=1.0)
     assert fit.problem.law == EQUAL
 
 
 def test_a_small_motion_does_not_show_a_difference_and_says_so():
     b = bench(k_asym=0.08, bias_asym=0.04)
     record, known = seen(b, 3000, WEAK_MOTION), {**KNOWN, "k_asym": Parameter(name="k_asym", unit="1")}
-    fit = estimate_bearing([record], known, laws=[EQUAL], extend=False, delay=1.0)
+    fit = estimate_bearing([record], known, laws=[EQUAL], extend=(), delay=1.0)
     found = uncertainty(fit)
     sd = np.sqrt(np.diag(found.information))[found.names.index("k_asym")]
     number = next(n for n in fit.problem.numbers if n.name == "k_asym")
@@ -98,14 +98,14 @@ def test_a_small_motion_does_not_show_a_difference_and_says_so():
 
 def test_an_eddy_pole_is_found():
     b = bench(eddy_pole=3000.0)
-    fit = estimate_bearing([seen(b, 4000)], KNOWN, laws=[EQUAL], extend=False, eddy=True, delay=1.0)
+    fit = estimate_bearing([seen(b, 4000)], KNOWN, laws=[EQUAL], extend=(), eddy=True, delay=1.0)
     right(fit, truth(b), {**BARS, "a": 0.03})
     assert whiteness(fit, 0).p > 1e-3
 
 
 def test_an_eddy_pole_that_is_left_out_shows_in_past_voltages_alone():
     record = seen(bench(eddy_pole=3000.0), 4000)
-    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=False, delay=1.0)
+    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=(), delay=1.0)
     assert abs(fit.problem.values(fit.vector)["m"] / 4.0 - 1.0) > 0.03  # it would be believed
     test = whiteness(fit, 0)
     assert test.p < 1e-6
@@ -136,7 +136,7 @@ def lossy():
 def test_drop_and_limits_of_the_stage_are_identified(lossy):
     b, record = lossy
     known = {**KNOWN, "v_drop": Parameter(name="v_drop", unit="V")}
-    fit = estimate_bearing([record], known, laws=[EQUAL], extend=False, delay=1.0)
+    fit = estimate_bearing([record], known, laws=[EQUAL], extend=(), delay=1.0)
     found = right(fit, truth(b), {**BARS, "v_drop": 0.01})
     assert "i_drop" in found.names  # a width that is wrong makes the drop wrong: both are free
     assert whiteness(fit, 0).p > 1e-3
@@ -144,7 +144,7 @@ def test_drop_and_limits_of_the_stage_are_identified(lossy):
 
 def test_a_drop_that_is_left_out_shows(lossy):
     _, record = lossy
-    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=False, delay=1.0)
+    fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=(), delay=1.0)
     assert whiteness(fit, 0).p < 1e-6
     assert fit.problem.values(fit.vector)["R"] > 1.8  # it is taken for a resistance
 
