@@ -34,7 +34,15 @@ def test_units_become_si_and_a_number_tells_the_gap_law():
     )
 
 
-@pytest.mark.parametrize("text", [MAGNET, "[magnet]\n", "[magnet]\nkind = 'pair'\neddy = true\ndrift = true\n"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        MAGNET,
+        "[magnet]\n",
+        "[magnet]\nkind = 'pair'\neddy = true\ndrift = true\n",
+        "[magnet]\nkind = 'pair'\nasymmetric = true\nsaturation = false\n",
+    ],
+)
 def test_what_is_written_is_read_again(text, tmp_path):
     before = rig(text)
     path = tmp_path / "again.toml"
