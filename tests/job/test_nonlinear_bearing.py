@@ -245,3 +245,23 @@ def test_records_that_contradict_each_other_are_told_and_their_intervals_hold_th
 def test_sound_records_agree(estimate):
     assert estimate.checks["records_agree"].passed
     assert estimate.covariance_method == "information"
+
+
+def test_facts_of_a_record_are_compared_with_the_estimate():
+    """An offset of the voltage lets the means contradict R, unless the rig says that there is one."""
+    _, told = ball()
+    record = package.simulate("levitated-ball", duration=1.0, seed=2, nonlinear=True)
+    far = 0.05 * float(record["voltage"].values.mean())
+    moved = replace(
+        record,
+        channels=tuple(replace(c, values=c.values + far) if c.name == "voltage" else c for c in record.channels),
+    )
+    sound, contradicted = (identify_nonlinear(x, told) for x in (record, moved))
+    assert {"ohm", "belonging", "sampling", "log_runs", "position_size"} <= sound.checks.keys()
+    assert sound.verdict.word == "usable"
+    check = contradicted.checks["ohm"]
+    assert (check.passed, check.cause) == (False, "ohm")
+    assert contradicted["R"].sd > 0.9 * abs(check.size)
+    given = Parameter(name="v_offset", unit="V", value=far, role="prior", sd=0.1 * far)
+    rig = replace(told, magnet=replace(told.magnet, parameters=(*told.magnet.parameters, given)))
+    assert identify_nonlinear(moved, rig).checks.get("ohm") is None

@@ -15,6 +15,7 @@ from ambid.bearing.magnet_likelihood import search, uncertainty
 from ambid.job.nonlinear_bearing import TakenRecord, judge_bearing
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
+from ambid.rig import rig_of_preset
 from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
 from tests.tiers import runs
@@ -31,6 +32,7 @@ def outcomes() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     bench, truth = preset("unstable-bearing"), truth_of(preset("unstable-bearing"))
     x, i = (a.ravel() for a in np.meshgrid(np.linspace(-0.6, 0.6, 5) * truth["s"], [-0.6, 0.0, 0.6]))
     exact, _ = LAW.table(x, i, truth)
+    rig = rig_of_preset(bench)
     numbers, curves, white, reach, seed = [], [], [], [], 0
     while len(numbers) < RUNS:
         seed += 1
@@ -44,8 +46,8 @@ def outcomes() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         known, values = uncertainty(fit), fit.problem.values(fit.vector)
         sds = np.sqrt(np.diag(known.information))
         numbers.append([(values[n] - truth[n]) / sd for n, sd in zip(known.names, sds, strict=True)])
-        taken = [TakenRecord(record=record, remembered={}, warnings=(), start_s=0.0)]
-        found = judge_bearing(fit, known, taken, delay_given=True).curves(x, i)
+        taken = [TakenRecord(record=record, bench=done.record, remembered={}, warnings=(), start_s=0.0)]
+        found = judge_bearing(fit, known, taken, rig).curves(x, i)
         curves.append(
             [(c.value - exact[:, j]) / c.sd for j, c in enumerate((found.force, found.k_x, found.k_i, found.L))]
         )

@@ -18,6 +18,7 @@ import numpy as np
 
 from ambid.bearing.linear import greybox
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, linearise, promise, search
+from ambid.bearing.magnet_likelihood import uncertainty as magnet_uncertainty
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.bearing.magnet_rescue import EVALUATIONS, rescue
 from ambid.bearing.multistart import Signals
@@ -37,6 +38,7 @@ _TRIED = 15  # iterations with which laws are compared
 _LONG = 30  # iterations with which a richer law is
 _HINT = 1e-3  # of the leakage: how much it rises where only its promise is asked
 _SATURATES = 0.2  # of the start value of sigma, likewise
+_PLAIN = 3.0  # standard deviations from which saturation is known
 _KNEES = (0.4, 1.0, 3.0)  # times the knee at which a search begins
 _LIKELY = 0.5  # share of its price that a part of the law must promise to be searched
 PARTS = {"asymmetric": ("k_asym", "i0_asym"), "rise": ("L_rise", "i_knee"), "saturation": ("sigma",)}
@@ -93,7 +95,7 @@ def estimate_bearing(
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
         if "saturation" in extend:
             richer = _extended(fit, "saturation", parameters, short, linear, again)
-            fit = richer if white is None or white(richer) else fit
+            fit = richer if _saturates(richer) and (white is None or white(richer)) else fit
         fit = rescue(
             fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
             lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
@@ -194,6 +196,13 @@ def _extended(
         return fit
     richer = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
     return richer if fit.criterion - richer.criterion > price else fit
+
+
+def _saturates(fit: BearingFit) -> bool:
+    """Whether sigma is known to be above zero, by the scatter over stretches too."""
+    spread = magnet_uncertainty(fit)
+    sd = dict(zip(spread.names, np.sqrt(np.diag(spread.covariance(robust=True))), strict=True))
+    return fit.problem.law.saturation and fit.problem.values(fit.vector)["sigma"] > _PLAIN * sd.get("sigma", 0.0)
 
 
 def _promises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:

@@ -122,7 +122,7 @@ _GRAVE = frozenset(
 """Checks after whose failure no number is to be used."""
 _OF_THE_RECORD = ("belonging", "position_size", "resolution", "signals_sound", "log_runs", "sampling")
 """Checks of the record itself: what they find is told first, in this order."""
-_EVIDENCE = frozenset({"ohm", "gravity_balance", "fixed_agree", "loop_agrees", "sampling"})
+_EVIDENCE = frozenset({"ohm", "gravity_balance", "carries_its_weight", "fixed_agree", "loop_agrees", "sampling"})
 """Checks of a fact each: two that contradict the estimate are as grave as one above."""
 
 

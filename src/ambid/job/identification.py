@@ -392,7 +392,7 @@ def identify_nonlinear(
         )
     clock.lap("fit")
     say("check")
-    estimate = judge_bearing(fit, uncertainty(fit), readings, delay_given=wanted != "auto")
+    estimate = judge_bearing(fit, uncertainty(fit), readings, bench)
     clock.lap("checks")
     estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=readings)
     if second is not None:

@@ -27,9 +27,17 @@ from ambid.estimation.uncertainty import WEAK
 from ambid.job.data import Reading, Source, known_rig, load_bench, origin, overlap
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
+from ambid.record import Record
 from ambid.rig import Rig, RigMagnet
 from ambid.settings.caller import setting
-from ambid.validation.nonlinear_bearing import WhitenessTest, agreement, agreement_check, whiteness, whiteness_checks
+from ambid.validation.nonlinear_bearing import (
+    WhitenessTest,
+    agreement,
+    agreement_check,
+    record_facts,
+    whiteness,
+    whiteness_checks,
+)
 
 _OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
 _LINEAR = ("m", "R", "c")  # numbers that stand with the linear model's
@@ -46,6 +54,7 @@ class TakenRecord:
     """A record that was read for a nonlinear bearing."""
 
     record: BearingRecord  # what the predictor runs over
+    bench: Record  # what that was made of, channels by role
     # ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` and ``history``, for the estimate
     remembered: Mapping[str, object]
     warnings: tuple[str, ...]  # what was changed in it
@@ -127,7 +136,9 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
         reading = touching(reading, rig.limits.position)
         warnings += _stops(reading)
     provenance = {**origin(bench), "held": held}
-    return TakenRecord(record=reading, remembered=provenance, warnings=tuple(warnings), start_s=bench.start_s)
+    return TakenRecord(
+        record=reading, bench=bench, remembered=provenance, warnings=tuple(warnings), start_s=bench.start_s
+    )
 
 
 def _stops(record: BearingRecord) -> list[str]:
@@ -254,10 +265,10 @@ def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:
 
 
 def judge_bearing(
-    fit: BearingFit, spread: BearingUncertainty, readings: Sequence[TakenRecord], *, delay_given: bool
+    fit: BearingFit, spread: BearingUncertainty, readings: Sequence[TakenRecord], rig: Rig
 ) -> NonlinearBearingEstimate:
     """Check a fit that has not failed, with its `spread`, on its own `readings`; estimate without validation, timings
-    and rig. `delay_given`: the rig gives the delay.
+    and rig.
     """
     problem, names = fit.problem, _names(fit)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
@@ -266,11 +277,12 @@ def judge_bearing(
     alone = agreement(fit, spread, alone=True)
     residuals |= {"records_agree": agreement_check(alone)} if alone.strides else {}
     robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
-    if robust:
-        others = agreement(fit, spread, alone=False)
-        spread = replace(spread, disagreement=np.vstack([x.beyond_chance() for x in (alone, others)]))
+    moves = [alone.beyond_chance(), agreement(fit, spread, alone=False).beyond_chance()] if robust else []
+    told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig)
+    spread = replace(spread, disagreement=np.vstack([*moves, contradicted]))
+    robust = robust or len(contradicted) > 0
     parameters = _parameters(fit, spread, robust=robust)
-    checks = {**residuals, "identifiable": _shown(parameters)} | _gravity(fit)
+    checks = {**told, **residuals, "identifiable": _shown(parameters)} | _gravity(fit)
     noise = {
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
         for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
@@ -278,11 +290,12 @@ def judge_bearing(
     points = np.concatenate([r.kept for r in problem.records])
     moving = np.concatenate([r.kept for r in problem.records if not r.held])
     changed = tuple(w for t in readings for w in t.warnings)
+    delays = _delays(fit, spread, given=rig.channel("voltage").delay != "auto")
     return NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
         law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in readings),
         parameters=parameters, covariance_names=spread.names, covariance=spread.covariance(robust=robust),
-        covariance_method="robust" if robust else "information", delay=_delays(fit, spread, given=delay_given),
+        covariance_method="robust" if robust else "information", delay=delays,
         noise=noise, fit=_fits(fit, tests, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
         usual=_between(*np.quantile(moving, (0.025, 0.975), axis=0)),
         operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),

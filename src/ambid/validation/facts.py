@@ -188,8 +188,8 @@ def agreements(
     checks = {name: c for name, c in facts(record, rig, belongs=force).items() if name != "weight"}
     means = checks["ohm"].values
     if means:
-        checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), means["value"], means["sd"])
-    checks["sampling"] = _sampling(theta, sd, record.rate_hz)
+        checks["ohm"] = ohm(record, theta["R"], alone.get("R", 0.0), means["value"], means["sd"])
+    checks["sampling"] = sampling(theta, sd, record.rate_hz)
     return checks
 
 
@@ -217,7 +217,8 @@ def _left(y: Array, rows: Array) -> float:
     return float(rest @ rest)
 
 
-def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Check:
+def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Check:
+    """Compare R with the means of a record, `mean` and its sd, ohm."""
     far = (R - mean) / float(np.hypot(sd, mean_sd))
     passed = abs(far) <= _FAR
     i0 = float(record["current"].values.mean())
@@ -236,7 +237,7 @@ def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Ch
     )  # fmt: skip
 
 
-def _sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: float) -> Check:
+def sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: float) -> Check:
     """Check that the coil is slower than the sampling, in samples of L/R at the upper end of L's interval."""
     R, L = theta["R"], theta["L"]
     if "L" not in sd:

@@ -15,11 +15,15 @@ from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import p_text
+from ambid.record import Record
+from ambid.rig import Rig
+from ambid.validation.facts import facts, ohm, sampling
 from ambid.validation.physical import Agreement
 from ambid.validation.residuals import P_LEAST, fit_of, joint_triangle, score_of
 from ambid.validation.second_record import conclude, consistency_check
 
 _ROLES = ("position", "current")
+_STAGE = ("v_offset", "v_drop", "i_offset")  # numbers that move the means of voltage and current
 _NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
 _LAGS = (1, 2, 3, 5, 8, 13)
 _INPUT_LAGS = (1, 2, 3, 4, 6, 9, 14, 21)
@@ -236,6 +240,46 @@ def agreement(fit: BearingFit, spread: BearingUncertainty, *, alone: bool) -> Ag
     n = len(spread.names)
     shift, sd = np.array(shifts).reshape(-1, n), np.array(sds).reshape(-1, n)
     return Agreement(names=spread.names, shift=shift, sd=sd, strides=tuple(used))
+
+
+def record_facts(
+    fit: BearingFit, spread: BearingUncertainty, benches: Sequence[Record], names: Sequence[str], rig: Rig
+) -> tuple[dict[str, Check], Array]:
+    """Compare what each record says by itself with the estimate, and return the worst of each check, and how far R and
+    the offset of the voltage move where the means contradict them, (n_contradicting, n), SI. `benches`: channels by
+    role; `names`: of the records.
+
+    A rig that gives an offset or a drop of the stage explains the means by it, and a stage that is off has none.
+    """
+    values, law = fit.problem.values(fit.vector), fit.problem.law
+    covariance = spread.covariance(robust=True)
+    sd = dict(zip(spread.names, np.sqrt(np.diag(covariance)), strict=True))
+    explained = rig.magnet is not None and any(rig.magnet.known(n) is not None for n in _STAGE)
+    found: dict[str, list[tuple[str, Check]]] = {}
+    moves = list[list[float]]()
+    for record, bench, name in zip(fit.problem.records, benches, names, strict=True):
+        roles = ("voltage", "current") if record.held else ("voltage", "current", "position")
+        checks = facts(replace(bench, channels=tuple(bench[role] for role in roles)), rig)
+        means = checks.pop("ohm").values
+        if means and not explained and not np.any(record.loose > 0.0):
+            checks["ohm"] = ohm(bench, values["R"], sd.get("R", 0.0), means["value"], means["sd"])
+            shift = checks["ohm"].size or 0.0
+            by = {"R": shift, "v_offset": -shift * float(bench["current"].values.mean())}
+            moves += [[by.get(n, 0.0) for n in spread.names]] * (shift != 0.0)
+        if not record.held:
+            at = record.kept.mean(axis=0, keepdims=True) - [values["x_offset"], values["i_offset"]]
+            table, slopes = law.table(at[:, 0], at[:, 1], values)
+            by_number = dict(zip(law.names, slopes[0, 3], strict=True))
+            g = np.array([by_number.get(n, 0.0) for n in spread.names])
+            coil = {"R": values["R"], "L": float(table[0, 3])}
+            checks["sampling"] = sampling(coil, {"L": float(np.sqrt(g @ covariance @ g))}, record.rate_hz)
+        checks.pop("weight", None)
+        for check, result in checks.items():
+            found.setdefault(check, []).append((name, result))
+    worst = {k: min(x, key=lambda c: (c[1].passed, -abs(c[1].values.get("apart_sd", 0.0)))) for k, x in found.items()}
+    several = len(names) > 1
+    told = {k: replace(c, detail=f"{name}: {c.detail}" if several else c.detail) for k, (name, c) in worst.items()}
+    return told, np.array(moves).reshape(-1, len(spread.names))
 
 
 def agreement_check(alone: Agreement) -> Check:
