@@ -125,7 +125,10 @@ class _Window:
             out += [-d, -1j * d]
         return np.array(out)
 
-    def _rows(self) -> Rows:
+    def search(self, poles: Complex) -> Complex:
+        """Most likely poles from these on, the noise as it is."""
+        start = np.ascontiguousarray(poles / self.lines.step).view(np.float64).copy()
+
         def residual(v: Array) -> Array:
             e = self.project(v.view(np.complex128) * self.lines.step).e.ravel()
             return np.concatenate([e.real, e.imag])
@@ -134,12 +137,7 @@ class _Window:
             J = self.slopes(v.view(np.complex128) * self.lines.step).reshape(v.size, -1)
             return np.concatenate([J.real, J.imag], axis=1).T
 
-        return Rows(residual, slope)
-
-    def search(self, poles: Complex) -> Complex:
-        """Most likely poles from these on, the noise as it is."""
-        start = np.ascontiguousarray(poles / self.lines.step).view(np.float64).copy()
-        end = search(self._rows(), start, most=25, tolerance=1e-7)
+        end = search(Rows(residual, slope), start, most=25, tolerance=1e-7)
         return np.asarray(end.theta.view(np.complex128) * self.lines.step)
 
     def fit(self, poles: Complex, rounds: int = 2) -> Complex:

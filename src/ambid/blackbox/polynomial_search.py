@@ -231,7 +231,15 @@ def starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     elif layout.nd:
         yield from _generalised(free, y, u)
     elif layout.nc:
-        yield from _hannan_rissanen(free, y, u)
+        # ARMAX and ARMA: the long model's innovations as one more input
+        long = _long_model(free, y, u)
+        e = filter_signal(long.P, np.ones(1), y)
+        for q, x in zip(long.Q, u, strict=True):
+            e -= filter_signal(q, np.ones(1), x)
+        arx = arx_layout(free.na, (*free.nb, free.nc), (*free.nk, 1), at_rest=free.at_rest)
+        plant = arx.polynomials(arx_coefficients(arx, y, np.vstack([u, e])))
+        C = reflect(np.concatenate([[1.0], plant.B[-1][1:]]))
+        yield free.coefficients(A=plant.A, B=plant.B[:-1], C=C)
     yield _least_squares(free, y, u)
 
 
@@ -304,18 +312,6 @@ def _shifts(c: Array, n_columns: int, lag: int) -> Array:
         if j + lag < c.size:
             out[j + lag :, j] = c[: c.size - j - lag]
     return out
-
-
-def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """ARMAX and ARMA: the long model's innovations as one more input."""
-    long = _long_model(layout, y, u)
-    e = filter_signal(long.P, np.ones(1), y)
-    for q, x in zip(long.Q, u, strict=True):
-        e -= filter_signal(q, np.ones(1), x)
-    arx = arx_layout(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
-    plant = arx.polynomials(arx_coefficients(arx, y, np.vstack([u, e])))
-    C = reflect(np.concatenate([[1.0], plant.B[-1][1:]]))
-    yield layout.coefficients(A=plant.A, B=plant.B[:-1], C=C)
 
 
 def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:

@@ -456,7 +456,11 @@ class _Fits:
 def _fits(v: _Values) -> _Fits:
     base, _ = _base(v)
     x, y, sd = (v.t - v.t[0]) / MONTH_S, v.y / base - 1.0, v.sd / abs(base)
-    y = _calmed(y, sd)
+    # values that lie far from those around them are drawn to four standard deviations
+    half = _WINDOW // 2
+    padded = np.pad(y, half, mode="edge")
+    around = np.median(np.lib.stride_tricks.sliding_window_view(padded, _WINDOW), axis=1)
+    y = around + np.clip(y - around, -4.0 * sd, 4.0 * sd)
     w = 1.0 / sd**2
     W, Y, Q = (np.cumsum(a) for a in (w, w * y, w * y * y))
     split = Q[-1] - Y[:-1] ** 2 / W[:-1] - (Y[-1] - Y[:-1]) ** 2 / (W[-1] - W[:-1])
@@ -478,14 +482,6 @@ def _fits(v: _Values) -> _Fits:
     follow = min(max(float(e[1:] @ e[:-1] / (e @ e)), 0.0), 0.95) if e @ e > 0 else 0.0
     scale = max(1.0, float(e @ e) / max(e.size - 3, 1)) * (1.0 + follow) / (1.0 - follow)
     return _Fits(x=x, y=y, w=w, chi=chi, after=after, bend=bend, scale=scale)
-
-
-def _calmed(y: Array, sd: Array) -> Array:
-    """Draw values that lie far from those around them to four standard deviations."""
-    half = _WINDOW // 2
-    padded = np.pad(y, half, mode="edge")
-    around = np.median(np.lib.stride_tricks.sliding_window_view(padded, _WINDOW), axis=1)
-    return around + np.clip(y - around, -4.0 * sd, 4.0 * sd)
 
 
 def _line(x: Array, y: Array, w: Array) -> tuple[Array, Array, float]:

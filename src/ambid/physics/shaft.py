@@ -303,7 +303,17 @@ class Shaft:
 
         for plane in planes:
             _inside("a plane", plane, self.z, self.z + self.length)
-        z = self._nodes(planes)
+        # ends of steps, discs and planes, and between them as many nodes as the number of elements asks for
+        ends = self.z + np.concatenate([[0.0], np.cumsum([step.length for step in self.steps])])
+        kept = list(ends)
+        for x in (*(disc.z for disc in self.discs), *planes):
+            if min(abs(x - y) for y in kept) > _SAME * self.length:
+                kept.append(x)
+        parts = []
+        for a, b in pairwise(sorted(kept)):
+            n = max(1, round((b - a) / self.length * self.elements))
+            parts.append(a + (b - a) * np.arange(n) / n)
+        z = np.concatenate([*parts, ends[-1:]])
         M, K, P = self._matrices(z)
         if not 0 <= modes <= M.shape[0] - 2:
             raise ModelError(f"{modes} bending modes are asked for; this shaft has {M.shape[0] - 2}. Ask for fewer")
@@ -336,19 +346,6 @@ class Shaft:
         forces = np.zeros((2 * z.size, len(planes)))
         forces[[2 * _node(z, plane) for plane in planes], np.arange(len(planes))] = 1.0
         return np.column_stack([forces, P @ np.column_stack([rigid[:, 1], basis])])
-
-    def _nodes(self, planes: Sequence[float]) -> Array:
-        """Ends of steps, discs and planes, and between them as many nodes as the number of elements asks for."""
-        ends = self.z + np.concatenate([[0.0], np.cumsum([step.length for step in self.steps])])
-        kept = list(ends)
-        for x in (*(disc.z for disc in self.discs), *planes):
-            if min(abs(x - y) for y in kept) > _SAME * self.length:
-                kept.append(x)
-        parts = []
-        for a, b in pairwise(sorted(kept)):
-            n = max(1, round((b - a) / self.length * self.elements))
-            parts.append(a + (b - a) * np.arange(n) / n)
-        return np.concatenate([*parts, ends[-1:]])
 
     def _matrices(self, z: Array) -> tuple[Array, Array, Array]:
         """Mass, stiffness and polar-inertia matrix of one plane, each (2 n_nodes, 2 n_nodes)."""

@@ -104,7 +104,10 @@ class _Unfailing:
         content = bytes(data)
         if self._failure is None:
             try:
-                self._put(content)
+                self._plain.seek(self._at)
+                rest = memoryview(content)
+                while rest:  # an unbuffered file may take a part, and fails with the next one
+                    rest = rest[self._plain.write(rest) or 0 :]
             except OSError as failure:
                 self.fail(failure)
         if self._failure is not None:
@@ -112,12 +115,6 @@ class _Unfailing:
         self._at += len(content)
         self._size = max(self._size, self._at)
         return len(content)
-
-    def _put(self, content: bytes) -> None:
-        self._plain.seek(self._at)
-        rest = memoryview(content)
-        while rest:  # an unbuffered file may take a part, and fails with the next one
-            rest = rest[self._plain.write(rest) or 0 :]
 
     def truncate(self, size: int) -> int:
         self._size = size

@@ -51,11 +51,17 @@ def design_sections(design: Design) -> list[Section]:
     limits = ", ".join(f"{name} up to {figure_text(name, x).partition(' (')[0]}" for name, x in goals.limits.items())
     aims = f"method {d.method}; small: {' and '.join(goals.minimise)}; limits on all plants: {limits}"
     head = title_line(RecordEntry.of(d.record), f"controller for model {d.model}", d.status)
+    rows: list[tuple[str, ...]] = [("axis", "opened at", "loop", "gain", "phase", "delay", "disk margin")]
+    for axis in d.after.margins:
+        for place in ("position", "command"):
+            for words, s in (("before", d.before), ("after", d.after)):
+                cells = opening_cells(getattr(s.margins[axis], place))[:4]
+                rows.append((axis, place.replace("command", "input"), words, *cells))
     return [
         Section(parts=[Lines(lines=[head], wrap=False), Lines(lines=[aims], indent=2)]),
         _figures(d),
         *_speeds(d),
-        _margins(d),
+        Section(heading=[("margins on the estimate, one loop opened", "strong")], parts=[grid(rows)]),
         *([verification_section((d.trials["before"], d.trials["after"]))] if d.trials else []),
         _plants(d),
         _loop(d),
@@ -106,16 +112,6 @@ def _speeds(d: Design) -> list[Section]:
     ]
     heading = [("highest peak over the speed, of some plants that judge", "strong")]
     return [Section(heading=heading, parts=[grid([("rpm", *sweep.peak), *rows])])]
-
-
-def _margins(d: Design) -> Section:
-    rows: list[tuple[str, ...]] = [("axis", "opened at", "loop", "gain", "phase", "delay", "disk margin")]
-    for axis in d.after.margins:
-        for place in ("position", "command"):
-            for words, s in (("before", d.before), ("after", d.after)):
-                cells = opening_cells(getattr(s.margins[axis], place))[:4]
-                rows.append((axis, place.replace("command", "input"), words, *cells))
-    return Section(heading=[("margins on the estimate, one loop opened", "strong")], parts=[grid(rows)])
 
 
 def _plants(d: Design) -> Section:

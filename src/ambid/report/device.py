@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ambid.acquisition.device import Counters
     from ambid.acquisition.quality import ColumnQuality, QualityReport
     from ambid.acquisition.recorder import Recorded
-    from ambid.acquisition.session import Acquired, RunReport
+    from ambid.acquisition.session import Acquired
 
 
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
@@ -92,7 +92,18 @@ def acquired_sections(acquired: Acquired) -> list[Section]:
         f"{path}: {counted(stored, 'sample')}{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from "
         f"{info.kind} {info.port}"
     )
-    words = _line_words(run, acquired.counters)
+    counters = acquired.counters
+    words = (
+        f"{counted(run.lost, 'sample')} lost, {counted(counters.damaged, 'frame')} damaged, "
+        f"{counted(counters.overruns, 'block')} overrun"
+    )
+    if run.lost:
+        words += f"; read it with {setting('gaps')}"
+    busy = counters.controller.get("busy_us")
+    if busy is not None:
+        words += f"; longest controller tick {busy:.0f} us"
+    if math.isfinite(counters.drift):
+        words += f"; controller clock off by {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm"
     return [
         Section(parts=[Lines(lines=[head])]),
         Section(title="Columns", parts=[_table(q)]),
@@ -110,21 +121,6 @@ def recorded_sections(recorded: Recorded) -> list[Section]:
     if damage.tail_bytes and not damage.closed:
         text += f"; {counted(damage.tail_bytes, 'byte')} at the end of the journal are not a whole block"
     return [Section(parts=[Lines(lines=[["", text]], hang=True)])]
-
-
-def _line_words(run: RunReport, counters: Counters) -> str:
-    words = (
-        f"{counted(run.lost, 'sample')} lost, {counted(counters.damaged, 'frame')} damaged, "
-        f"{counted(counters.overruns, 'block')} overrun"
-    )
-    if run.lost:
-        words += f"; read it with {setting('gaps')}"
-    busy = counters.controller.get("busy_us")
-    if busy is not None:
-        words += f"; longest controller tick {busy:.0f} us"
-    if math.isfinite(counters.drift):
-        words += f"; controller clock off by {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm"
-    return words
 
 
 def _noise_words(q: QualityReport) -> str:

@@ -46,12 +46,19 @@ def experiment_sections(experiment: Experiment) -> list[Section]:
             f"amplitude {sized(x.table.amplitude, 'V')}"
         )
     flat = "flat: standard deviation with a flat multisine of the same band and use of the limits"
+    rows: list[tuple[str, ...]] = [("", "peak", "limits", "in use", "drawn plants")]
+    for name, s in x.signals.items():
+        if s.low is None and s.high is None:
+            continue
+        ends = " … ".join("any" if e is None else sized(e, s.unit) for e in (s.low, s.high))
+        most = f"{100.0 * max(s.steady, s.from_rest):.0f} %"
+        rows.append((name, sized(s.peak, s.unit), ends, most, f"{100.0 * s.drawn:.0f} %"))
     return [
         Section(heading=[(title_of(x), "strong")], parts=[Lines(lines=lines)]),
         Section(heading=[("what the record will show", "strong")], parts=[expected_table(x), Lines(lines=[flat])]),
         Section(
             heading=[("deviations from rest, four standard deviations of noise kept free", "strong")],
-            parts=[_signals(x)],
+            parts=[grid(rows)],
         ),
         *ending(x),
     ]
@@ -74,17 +81,6 @@ def expected_table(x: Experiment) -> Table:
         value = quantity(e.value, e.sd, e.unit).text.removesuffix(" 1")
         moved = _NONE if e.shift is None else f"{e.shift:+.1f} sd"
         rows.append((name, value, f"{100.0 * e.relative_sd:.2g} %", f"{e.flat_sd / e.sd:.2g} times", moved, needed))
-    return grid(rows)
-
-
-def _signals(x: Experiment) -> Table:
-    rows: list[tuple[str, ...]] = [("", "peak", "limits", "in use", "drawn plants")]
-    for name, s in x.signals.items():
-        if s.low is None and s.high is None:
-            continue
-        ends = " … ".join("any" if e is None else sized(e, s.unit) for e in (s.low, s.high))
-        most = f"{100.0 * max(s.steady, s.from_rest):.0f} %"
-        rows.append((name, sized(s.peak, s.unit), ends, most, f"{100.0 * s.drawn:.0f} %"))
     return grid(rows)
 
 

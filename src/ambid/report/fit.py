@@ -84,12 +84,13 @@ def fit_sections(fit: AnyFit) -> list[Section]:
         none = "none (diverges, or no input)"
         trainings = curve_lines(fit.curves)
     second = [] if fit.validation is None else second_parts(fit.validation)
+    text = ", ".join(f"{name} {value:.6g}" for name, value in fit.criteria.items())
     return [
         Section(parts=_header(fit)),
         *own,
         Section(title="Fit", parts=[fit_table(fit.fit, fit.units, none)]),
         Section(heading=[("on the second record", "strong")], parts=second),
-        Section(parts=[Lines(lines=_criteria(fit))]),
+        Section(parts=[Lines(lines=[f"criteria: {text}; {fit.n_estimated} parameters estimated"] if text else [])]),
         Section(parts=[Lines(lines=trainings, indent=2)]),
         *ending(fit),
         *(derived_section(x) for x in getattr(fit, "derived", {}).values()),
@@ -99,11 +100,6 @@ def fit_sections(fit: AnyFit) -> list[Section]:
 def derived_section(derived: Any) -> Section:
     """Return what was derived from a fit: the sensitivity of its coefficients, or physical parameters."""
     return sensitivity_section(derived) if isinstance(derived, SensitivityAnalysis) else physics_section(derived)
-
-
-def _criteria(fit: AnyFit) -> list[str]:
-    text = ", ".join(f"{name} {value:.6g}" for name, value in fit.criteria.items())
-    return [f"criteria: {text}; {fit.n_estimated} parameters estimated"] if text else []
 
 
 def _header(fit: AnyFit) -> list[Part]:

@@ -63,7 +63,13 @@ def fleet_sections(fleet: FleetRun) -> list[Section]:
         failures += [f"{len(records)} x {reason}", f"    {names}"]
     more = len(f.failures) - _REASONS
     failures += [f"and {counted(more, 'reason')} more; {setting('json')} has them all"] if more > 0 else []
-    spread = _spread(f)
+    spread: list[tuple[str, ...]] = []
+    for name in _names(f):
+        at, x, _ = _values(f, name)
+        if at:
+            unit = f.units.get(name, "1")
+            low, middle, high = (sized(float(q), unit, 4) for q in np.quantile(x, (0.05, 0.5, 0.95)))
+            spread.append((name, str(len(at)), middle, f"{low} .. {high}"))
     return [
         Section(parts=[Lines(lines=head, indent=2)]),
         Section(parts=[Lines(lines=[f"results: {judged}"] if judged else [], wrap=False)]),
@@ -88,17 +94,6 @@ def _values(fleet: FleetRun, name: str) -> tuple[list[int], list[float], list[fl
 
 def _names(fleet: FleetRun) -> list[str]:
     return list(dict.fromkeys(name for row in fleet.rows for name in row.values))
-
-
-def _spread(fleet: FleetRun) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    for name in _names(fleet):
-        at, x, _ = _values(fleet, name)
-        if at:
-            unit = fleet.units.get(name, "1")
-            low, middle, high = (sized(float(q), unit, 4) for q in np.quantile(x, (0.05, 0.5, 0.95)))
-            rows.append((name, str(len(at)), middle, f"{low} .. {high}"))
-    return rows
 
 
 def fleet_figure(fleet: FleetRun, title: str, width: float) -> Figure:

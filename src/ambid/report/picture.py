@@ -99,11 +99,7 @@ def _small(text: str, prefix: str) -> str:
     text = re.sub(r'( (?:x|y|width|height)="-?\d+\.\d\d)\d+', r"\1", text)
     text = re.sub(r"rotate\((-?\d+) (-?\d+\.\d)\d* (-?\d+\.\d)\d*", r"rotate(\1 \2 \3", text)
     text = re.sub(r">\s+<", "><", text)
-    return _merged(text)
-
-
-def _merged(text: str) -> str:
-    """Return an SVG with neighbours that look alike put together: bars and stems as one path, marks as one group."""
+    # neighbours that look alike are put together: bars and stems as one path, marks as one group
     for _ in range(2):
         text = re.sub(r"<g>(<[^/][^>]*/>)</g>", r"\1", text)
     lines = r'<path d="[^"]*"([^>]* fill="none"[^>]*)/>(?:<path d="[^"]*"\1/>)+'

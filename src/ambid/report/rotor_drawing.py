@@ -159,7 +159,8 @@ def _body(axes: Axes, shaft: Shaft) -> float:
         ring(z, step.length, step.diameter, step.bore, _STEEL, 1.0)
         z += step.length
     for disc in shaft.discs:  # a ring of the same mass and polar moment, as a drawing gives neither size
-        inner = _diameter_at(shaft, disc.z)
+        ends = shaft.z + np.cumsum([step.length for step in shaft.steps])
+        inner = shaft.steps[min(int(np.searchsorted(ends, disc.z)), len(shaft.steps) - 1)].diameter
         outer = math.sqrt(max(8 * disc.Ip / disc.m - inner**2, 0.0)) if disc.m else 0.0
         outer = min(max(outer, 1.5 * inner), _WIDEST * shaft.length)
         volume = disc.m / shaft.material.rho
@@ -167,11 +168,6 @@ def _body(axes: Axes, shaft: Shaft) -> float:
         ring(disc.z - width / 2, width, outer, inner, _DISC, 0.9)
         widest = max(widest, outer)
     return widest
-
-
-def _diameter_at(shaft: Shaft, z: float) -> float:
-    ends = shaft.z + np.cumsum([step.length for step in shaft.steps])
-    return shaft.steps[min(int(np.searchsorted(ends, z)), len(shaft.steps) - 1)].diameter
 
 
 def _shape(
@@ -229,7 +225,16 @@ def _campbell(
     if drawn is not None:
         apart = {"color": MEASURED, "label": "from the drawing", "linewidth": 1.0} if identified is not None else {}
         _lines(axes, drawn, None, {"linestyle": "--", **apart})
-    criticals = _criticals(axes, diagrams[0])
+    criticals = []  # where lines meet the speed, forward ones alone, which unbalance excites, in 1/min
+    for c in diagrams[0].critical_speeds():
+        forward = c.direction > -_PLANAR
+        axes.plot(
+            c.speed * 30 / np.pi, c.speed / (2 * np.pi), "o", markersize=6, markeredgecolor=BOUND, linestyle="none",
+            markerfacecolor=BOUND if forward else "white", zorder=5,
+            label="critical speed" if forward else "backward whirl at 1x",
+        )  # fmt: skip
+        if forward:
+            criticals.append(f"{c.speed * 30 / np.pi:.0f}")
     at = np.array([0.0, most])
     axes.plot(at * 30 / np.pi, at / (2 * np.pi), color=MEASURED, linewidth=0.9, label="speed itself (1x)")
     for speed in speeds:
@@ -257,21 +262,6 @@ def _lines(axes: Axes, which: Campbell, sd: Array | None, style: Mapping[str, An
         if sd is not None:
             half = NORMAL_95 * sd[:, k] / (2 * np.pi)
             axes.fill_between(x, f[:, k] - half, f[:, k] + half, color=color, alpha=0.25, linewidth=0)
-
-
-def _criticals(axes: Axes, which: Campbell) -> list[str]:
-    """Mark where lines meet the speed; return the forward ones, which unbalance excites, in 1/min."""
-    criticals = []
-    for c in which.critical_speeds():
-        forward = c.direction > -_PLANAR
-        axes.plot(
-            c.speed * 30 / np.pi, c.speed / (2 * np.pi), "o", markersize=6, markeredgecolor=BOUND, linestyle="none",
-            markerfacecolor=BOUND if forward else "white", zorder=5,
-            label="critical speed" if forward else "backward whirl at 1x",
-        )  # fmt: skip
-        if forward:
-            criticals.append(f"{c.speed * 30 / np.pi:.0f}")
-    return criticals
 
 
 _RPM = 30.0 / np.pi

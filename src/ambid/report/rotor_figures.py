@@ -100,8 +100,14 @@ class RotorEvidence:
         unbalance = balance_block(e.synchronous) if e.synchronous else None
         if unbalance is not None:
             blocks["unbalance"] = unbalance
-        blocks["poles"] = _poles(e)
-        blocks["correlations"] = _correlations(e)
+        spectrum = rotor_poles(e)
+        table = pole_table([(p.value, p.covariance) for p in spectrum if p.value.imag >= 0], times=True)
+        blocks["poles"] = poles_panel(spectrum, table, "poles of the identified rotor in its magnets, open loop")
+        # of the parameters, in the order of the rig, and of the modes' frequencies and dampings
+        modes = [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
+        variances = dict(zip(e.covariance_names, np.diag(e.covariance).tolist(), strict=True))
+        names = [name for name in (*(p.name for p in e.parameters), *modes) if variances.get(name, 0.0) > 0.0]
+        blocks["correlations"] = correlations_panel(names, e.covariance_of(tuple(names)), e.numbers)
         return blocks
 
 
@@ -284,17 +290,3 @@ def rotor_poles(estimate: RotorEstimate) -> list[Pole]:
     ]
     spread: Array = complex_covariance(np.array(moved).T, estimate.covariance)
     return sorted(roots(values.astype(complex), spread, _WIDEST), key=lambda pole: pole.value.real)
-
-
-def _poles(e: RotorEstimate) -> Block:
-    spectrum = rotor_poles(e)
-    table = pole_table([(p.value, p.covariance) for p in spectrum if p.value.imag >= 0], times=True)
-    return poles_panel(spectrum, table, "poles of the identified rotor in its magnets, open loop")
-
-
-def _correlations(e: RotorEstimate) -> Block:
-    """Correlations of the parameters, in the order of the rig, and of the modes' frequencies and dampings."""
-    modes = [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
-    variances = dict(zip(e.covariance_names, np.diag(e.covariance).tolist(), strict=True))
-    names = [name for name in (*(p.name for p in e.parameters), *modes) if variances.get(name, 0.0) > 0.0]
-    return correlations_panel(names, e.covariance_of(tuple(names)), e.numbers)

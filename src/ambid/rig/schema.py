@@ -357,7 +357,10 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     keys = _place(error["loc"], content)
     place, kind, limits = ".".join(keys), error["type"], error.get("ctx", {})
     if kind == "extra_forbidden":
-        return _unknown_key(keys)
+        *table, key = keys
+        own = list(_keys(_entry_at(table)))
+        inside = f"in [{'.'.join(table)}]" if table else "at the top"
+        return f"unknown key {key!r} {inside}; known: {', '.join(own)}.{nearest(key, own)}"
     if kind == "missing" and keys[-1] != "duty" and "limits" not in keys[:-1] and "trip" not in keys[:-1]:
         return f"{place} is missing. Add it"
     got = error["input"]
@@ -409,14 +412,6 @@ def _place(loc: tuple[int | str, ...], content: Any) -> list[str]:
         elif isinstance(content, dict) and part == loc[-1] and isinstance(part, str) and part.isidentifier():
             keys.append(part)
     return keys or ["the file"]
-
-
-def _unknown_key(keys: list[str]) -> str:
-    """Name an unknown key, the table it stands in, and the nearest known key."""
-    *table, key = keys
-    known = list(_keys(_entry_at(table)))
-    inside = f"in [{'.'.join(table)}]" if table else "at the top"
-    return f"unknown key {key!r} {inside}; known: {', '.join(known)}.{nearest(key, known)}"
 
 
 def _keys(entry: type[_Entry]) -> dict[str, Any]:

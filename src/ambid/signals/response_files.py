@@ -256,7 +256,8 @@ def _header(path: Path, words: Mapping[str, str]) -> tuple[list[str], list[str],
         return None
     delimiter = next((d for d in ("\t", ";", ",") if d in lines[first]), ",")
     cells, start = [x.strip() for x in lines[first].split(delimiter)], first + 1
-    if not _is_frequency(cells[0]):
+    name, unit = label_of(cells[0].replace("(", "[").replace(")", "]"))
+    if not (name.lower() in _FREQUENCY and unit in (None, "Hz", "kHz", "rad/s")):
         return None
     dialect = recognised(lines, path, _csv_words(words))
     if dialect is not None:
@@ -268,11 +269,6 @@ def _header(path: Path, words: Mapping[str, str]) -> tuple[list[str], list[str],
 
 def _csv_words(words: Mapping[str, str]) -> dict[str, str]:
     return {k: v for k, v in words.items() if k in ("decimal", "separator", "thousands", "encoding", "units")}
-
-
-def _is_frequency(cell: str) -> bool:
-    name, unit = label_of(cell.replace("(", "[").replace(")", "]"))
-    return name.lower() in _FREQUENCY and unit in (None, "Hz", "kHz", "rad/s")
 
 
 def _csv(path: Path, words: Mapping[str, str], inputs: Sequence[str], outputs: Sequence[str]) -> list[Function]:
