@@ -20,9 +20,9 @@ from ambid.rig.rig import (
     Rig,
     RigChannel,
     RigMagnet,
-    layout_line,
     rig_text,
     role_units,
+    toml_lines,
     toml_text,
 )
 from ambid.rig.roles import NAMES, SET_POINT, Candidate, at_rest, rank_roles
@@ -90,7 +90,7 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
 def _record_lines(record: Record) -> list[str]:
     """Begin the section of records with the layout that the file was read in."""
     layout = record.history[0].settings.get("layout") if record.history else None
-    return ["[record]", layout_line(layout)] if isinstance(layout, Mapping) else ["# [record]"]
+    return ["[record]", *toml_lines({"layout": layout})] if isinstance(layout, Mapping) else ["# [record]"]
 
 
 def axes_of(record: Record) -> list[str]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -17,10 +17,10 @@ from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import RotorModel
-from ambid.physics.shaft import Shaft
+from ambid.physics.shaft import Material, Shaft
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
-from ambid.rig.rotor import RigModes, shaft_lines
+from ambid.rig.rotor import RigModes
 from ambid.settings.caller import setting
 
 TRIP_SHARE = 0.9
@@ -437,29 +437,43 @@ def rig_text(rig: Rig, folder: Path) -> str:
     RigError
         If a calibration table has no file.
     """
-    lines = ['schema = "ambid.rig/1"', f"name = {toml_text(rig.name)}", f"model = {toml_text(rig.model)}"]
-    lines += ["open_loop = true"] if rig.open_loop else []
-    lines += [f'speed = {{ value = {rig.rotor.speed!r}, unit = "rad/s" }}'] if rig.rotor and rig.rotor.speed else []
-    lines += _rotor_lines(rig) if rig.rotor else []
-    inputs = rig.plant.inputs
+    rotor, plant, units = rig.rotor, rig.plant, role_units(rig.plant)
+    lines = toml_lines(
+        {
+            "schema": "ambid.rig/1", "name": rig.name, "model": rig.model, "open_loop": rig.open_loop or None,
+            "speed": _quantity(rotor.speed, "rad/s") if rotor and rotor.speed else None,
+        }
+    )  # fmt: skip
+    lines += _rotor_lines(rig, rotor) if rotor else []
     for c in rig.channels:
-        lines += ["", *_channel_lines(c, folder, is_input=c.role in inputs)]
-    planes = () if rig.rotor is None else rig.rotor.places
-    lines += ["", "[parameters]", *(_parameter_line(p) for p in rig.parameters if p.name not in planes)]
+        lines += ["", *_channel_lines(c, folder, is_input=c.role in plant.inputs)]
+    planes = () if rotor is None else rotor.places
+    lines += ["", "[parameters]", *_parameter_lines(p for p in rig.parameters if p.name not in planes)]
     if rig.magnet is not None:
         lines += ["", *_magnet_lines(rig.magnet)]
-    units = role_units(rig.plant)
     if rig.operating_point:
-        lines += ["", "[operating_point]"]
-        lines += [f'{role} = {{ value = {x!r}, unit = "{units[role]}" }}' for role, x in rig.operating_point.items()]
+        point = {role: _quantity(x, units[role]) for role, x in rig.operating_point.items()}
+        lines += ["", "[operating_point]", *toml_lines(point)]
     if rig.loop or rig.limits:
         lines += ["", *_loop_lines(rig.loop or Loop(), rig.limits)]
     if rig.noise:
-        lines += ["", *_noise_lines(rig.noise)]
-    if rig.record != RecordSettings():
-        lines += ["", *_record_lines(rig.record)]
-    if rig.daq:
-        lines += ["", *_daq_lines(rig.daq)]
+        steps = {role: getattr(rig.noise, f"{role}_resolution") or None for role in ("position", "current", "voltage")}
+        levels = {name: getattr(rig.noise, name) for name in ("position", "current", "force", "voltage")}
+        lines += ["", "[noise]", *toml_lines({**levels, "resolutions": steps if any(steps.values()) else None})]
+    if (r := rig.record) != RecordSettings():
+        record = {
+            "rate_hz": r.rate_hz, "rate_sd": r.rate_sd, "from": r.from_s, "to": r.to_s, "gaps": r.gaps,
+            "time": r.time and {"variable": r.time[0], "unit": r.time[1]}, "layout": r.layout or None,
+        }  # fmt: skip
+        lines += ["", "[record]", *toml_lines(record)]
+    if (d := rig.daq) is not None:
+        trips = {"position": d.position_trip, "current": d.current_trip}
+        daq = {
+            "rate_hz": d.rate_hz, "baud": d.baud, "duty": d.duty, "duty_off": d.duty_off, "host_ms": d.host_ms,
+            "lift_ms": d.lift_ms, "third": d.third or None, "bench": d.bench or None,
+            "trip": trips if any(trips.values()) else None,
+        }  # fmt: skip
+        lines += ["", "[daq]", *toml_lines(daq)]
     return "\n".join(lines) + "\n"
 
 
@@ -471,150 +485,141 @@ def toml_text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
+def toml_lines(entries: Mapping[str, object]) -> list[str]:
+    """Return a line ``key = value`` of TOML for each entry that is not None; mappings become inline tables."""
+    return [f"{key} = {_toml(value)}" for key, value in entries.items() if value is not None]
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, str):
+        return toml_text(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(toml_lines(value))} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return repr(value)
+
+
+def _quantity(value: float, unit: str) -> dict[str, object]:
+    return {"value": value, "unit": unit}
+
+
 def _channel_lines(c: RigChannel, folder: Path, *, is_input: bool) -> list[str]:
-    lines = [f"[channels.{c.role}]", f"column = {toml_text(c.column)}"]
-    lines += [f"variable = {toml_text(c.variable)}"] if c.variable else []
-    lines += [f"unit = {toml_text(c.unit)}"] if c.unit else []
-    lines += _calibration_lines(c.calibration, c.role, folder) if c.calibration else []
-    if is_input or c.delay:
-        lines.append('delay = "auto"' if c.delay == "auto" else f"delay = {c.delay}")
-    lines += [f"{key} = {x!r}" for key in ("gain_sd", "offset_sd") if (x := getattr(c, key)) is not None]
+    entries = {
+        "column": c.column, "variable": c.variable or None, "unit": c.unit or None,
+        **(_calibration_entries(c.calibration, c.role, folder) if c.calibration else {}),
+        "delay": c.delay if is_input or c.delay else None, "gain_sd": c.gain_sd, "offset_sd": c.offset_sd,
+    }  # fmt: skip
+    lines = [f"[channels.{c.role}]", *toml_lines(entries)]
     for sensor in c.sensors:
-        _, *entries = _channel_lines(sensor, folder, is_input=False)
-        lines += ["", f"[[channels.{c.role}.sensors]]", *entries]
+        lines += ["", f"[[channels.{c.role}.sensors]]", *_channel_lines(sensor, folder, is_input=False)[1:]]
     return lines
 
 
-def _calibration_lines(calibration: Calibration, role: str, folder: Path) -> list[str]:
+def _calibration_entries(calibration: Calibration, role: str, folder: Path) -> dict[str, object]:
     if calibration.raw is None:
-        gain = [] if calibration.unit_in == calibration.unit_out else [f"gain = {calibration.gain!r}"]
-        return [*gain, f"offset = {calibration.offset!r}"]
+        gain = None if calibration.unit_in == calibration.unit_out else calibration.gain
+        return {"gain": gain, "offset": calibration.offset}
     if not calibration.source:
         raise RigError(f"channels.{role} has a calibration table without a file; a rig file names one. Write it as CSV")
     table = os.path.relpath(Path(calibration.source).resolve(), folder.resolve())
-    return [
-        f"table = {toml_text(Path(table).as_posix())}",
-        *(["extrapolate = true"] if calibration.extrapolate else []),
-    ]
+    return {"table": Path(table).as_posix(), "extrapolate": calibration.extrapolate or None}
 
 
-def _parameter_line(p: Parameter) -> str:
-    entries = [f"value = {p.value!r}"] if p.value is not None else []
-    entries += [f'unit = "{p.unit}"', f'role = "{p.role}"']
-    entries += [f"sd = {p.sd!r}"] if p.sd is not None else []
-    return f"{toml_text(p.name) if '.' in p.name else p.name} = {{ {', '.join(entries)} }}"
+def _parameter_entry(p: Parameter) -> dict[str, object]:
+    return {"value": p.value, "unit": p.unit, "role": p.role, "sd": p.sd}
 
 
-def _rotor_lines(rig: Rig) -> list[str]:
-    assert rig.rotor is not None
+def _parameter_lines(parameters: Iterable[Parameter]) -> list[str]:
+    return toml_lines({toml_text(p.name) if "." in p.name else p.name: _parameter_entry(p) for p in parameters})
+
+
+def _rotor_lines(rig: Rig, rotor: RotorModel) -> list[str]:
     lines: list[str] = []
-
-    def plane(name: str) -> str:
-        return _parameter_line(replace(rig.parameter(name), name="x")).removeprefix("x = ")
-
-    for b in rig.rotor.bearings:
-        lines += ["", f"[bearings.{b.name}]", f"axes = {json.dumps(list(b.axes))}"]
-        lines += [f"runout = {_turning(r, 'm')}" for r in rig.runout if r.name == b.name]
+    for b in rotor.bearings:
+        runout = next(({**_quantity(r.value, "m"), "phase": r.phase} for r in rig.runout if r.name == b.name), None)
+        entries: dict[str, object] = {"axes": b.axes, "runout": runout}
         if b.axial:
-            lines.append("axial = true")
-            continue
-        lines.append(f"z = {plane(f'{b.name}.z')}")
-        read = [plane(b.sensor_parameter(k)) for k in range(len(b.z_sensors))]
-        lines.append(f"z_sensor = {read[0]}" if len(read) == 1 else f"z_sensors = [{', '.join(read)}]")
-        own = {key.removeprefix(f"{b.name}."): x for key, x in rig.plane_sd.items() if key.startswith(f"{b.name}.")}
-        lines += [f'{key} = {{ value = {x!r}, unit = "m" }}' for key, x in own.items()]
-    if rig.modes != RigModes():
-        count = '"auto"' if rig.modes.count is None else rig.modes.count
-        lines += ["", "[modes]", f"count = {count}"]
-        lines += [f"frequency_hz = {list(rig.modes.frequency_hz)}"] if rig.modes.frequency_hz else []
-        lines += _mode_lines(rig.modes.numbers, len(rig.modes.frequency_hz)) if rig.modes.numbers else []
+            entries["axial"] = True
+        else:
+            read = [_parameter_entry(rig.parameter(b.sensor_parameter(k))) for k in range(len(b.z_sensors))]
+            entries["z"] = _parameter_entry(rig.parameter(f"{b.name}.z"))
+            entries |= {"z_sensor": read[0]} if len(read) == 1 else {"z_sensors": read}
+            own = {key.removeprefix(f"{b.name}."): x for key, x in rig.plane_sd.items() if key.startswith(f"{b.name}.")}
+            entries |= {key: _quantity(x, "m") for key, x in own.items()}
+        lines += ["", f"[bearings.{b.name}]", *toml_lines(entries)]
+    if (modes := rig.modes) != RigModes():
+        count = "auto" if modes.count is None else modes.count
+        lines += ["", "[modes]", *toml_lines({"count": count, "frequency_hz": modes.frequency_hz or None})]
+        lines += _mode_lines(modes.numbers, len(modes.frequency_hz)) if modes.numbers else []
     for u in rig.unbalance:
-        lines += ["", f"[unbalance.{u.name}]", f"value = {u.value!r}", 'unit = "kg m"', f"phase = {u.phase!r}"]
-        lines.append(f'z = {{ value = {u.z!r}, unit = "m" }}')
-    return lines + (["", *shaft_lines(rig.shaft)] if rig.shaft else [])
-
-
-def _turning(turning: Turning, unit: str) -> str:
-    return f'{{ value = {turning.value!r}, unit = "{unit}", phase = {turning.phase!r} }}'
+        entries = {**_quantity(u.value, "kg m"), "phase": u.phase, "z": _quantity(u.z, "m")}
+        lines += ["", f"[unbalance.{u.name}]", *toml_lines(entries)]
+    return lines + (["", *_shaft_lines(rig.shaft)] if rig.shaft else [])
 
 
 def _mode_lines(numbers: Mapping[str, float], n: int) -> list[str]:
     places = [name.removeprefix("mode1.") for name in numbers if name.startswith("mode1.")]
     of = {place: [numbers[f"mode{r}.{place}"] for r in range(1, n + 1)] for place in places if place != "omega"}
-    lines = [f"damping = {of.pop('zeta')}", f"[modes.shapes]{_NOTE}"]
-    lines += [f"{toml_text(place)} = {shape}" for place, shape in of.items()]
-    terms = {name.removeprefix("gyro."): x for name, x in numbers.items() if name.startswith("gyro.")}
-    return [*lines, "[modes.gyroscopic]", *(f'"{name}" = {x!r}' for name, x in terms.items())] if terms else lines
+    lines = [*toml_lines({"damping": of.pop("zeta")}), f"[modes.shapes]{_NOTE}"]
+    lines += toml_lines({toml_text(place): shape for place, shape in of.items()})
+    terms = {f'"{name.removeprefix("gyro.")}"': x for name, x in numbers.items() if name.startswith("gyro.")}
+    return [*lines, "[modes.gyroscopic]", *toml_lines(terms)] if terms else lines
+
+
+def _shaft_lines(shaft: Shaft) -> list[str]:
+    lines = ["[shaft]"]
+    entries = {"z": _quantity(shaft.z, "m"), "material": _material_entry(shaft.material), "damping": shaft.zeta or None}
+    lines += toml_lines(entries)
+    for step in shaft.steps:
+        sizes = {"length": step.length, "diameter": step.diameter} | ({"bore": step.bore} if step.bore else {})
+        material = _material_entry(step.material) if step.material else None
+        lines += ["[[shaft.steps]]", *toml_lines({k: _quantity(x, "m") for k, x in sizes.items()})]
+        lines += toml_lines({"material": material})
+    for disc in shaft.discs:
+        units = {"z": "m", "m": "kg", "Id": "kg m^2", "Ip": "kg m^2"}
+        lines += ["[[shaft.discs]]", *toml_lines({k: _quantity(getattr(disc, k), unit) for k, unit in units.items()})]
+    return lines
+
+
+def _material_entry(material: Material) -> dict[str, object]:
+    return {"E": _quantity(material.E, "Pa"), "rho": _quantity(material.rho, "kg/m^3"), "nu": material.nu}
 
 
 def _magnet_lines(magnet: RigMagnet) -> list[str]:
-    lines = ["[magnet]", f'kind = "{magnet.kind}"']
-    lines += [f'gap = "{magnet.gap}"'] if magnet.gap else []
-    lines += [f"{name} = true" for name, on in (("eddy", magnet.eddy), ("drift", magnet.drift)) if on]
-    choices = {"asymmetric": magnet.asymmetric, "saturation": magnet.saturation, "rise": magnet.rise}
-    lines += [f"{name} = {str(on).lower()}" for name, on in choices.items() if on is not None]
-    lines += [] if magnet.off_below is None else [f"off_below = {magnet.off_below!r}"]
-    lines += [f"cone = {magnet.cone!r}"] if magnet.cone else []
-    return [*lines, "[magnet.parameters]", *map(_parameter_line, magnet.parameters)] if magnet.parameters else lines
+    entries = {
+        "kind": magnet.kind, "gap": magnet.gap, "saturation": magnet.saturation, "eddy": magnet.eddy or None,
+        "drift": magnet.drift or None, "asymmetric": magnet.asymmetric, "rise": magnet.rise,
+        "off_below": magnet.off_below, "cone": magnet.cone or None,
+    }  # fmt: skip
+    lines = ["[magnet]", *toml_lines(entries)]
+    return [*lines, "[magnet.parameters]", *_parameter_lines(magnet.parameters)] if magnet.parameters else lines
 
 
-def _law_lines(law: StateLaw) -> list[str]:
-    return [f"{name} = {getattr(law, name).tolist()!r}" for name in "ABCDG"]
+def _law_entries(law: StateLaw) -> dict[str, object]:
+    return {name: getattr(law, name).tolist() for name in "ABCDG"}
 
 
 def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:
-    lines = ["[loop]", f'kind = "{"pid" if loop.law is None else "state-space"}"']
-    if loop.law is None:
-        numbers: Mapping[str, float] = {"kp": loop.kp, "ki": loop.ki, "kd": loop.kd, "kc": loop.kc}
-        lines += [f"{name} = {value!r}" for name, value in numbers.items()]
-    else:
-        lines += [f"rate_hz = {loop.law.rate_hz!r}", *_law_lines(loop.law)]
-    if math.isfinite(loop.derivative_cutoff_hz):
-        lines.append(f"derivative_cutoff_hz = {loop.derivative_cutoff_hz!r}")
-    lines.append(f"delay = {loop.delay!r}")
-    if limits is not None:
-        intervals = {role: getattr(limits, role) for role in ("voltage", "current", "position")}
-        given = {role: x for role, x in intervals.items() if x != (-math.inf, math.inf)}
-        for role, (low, high) in given.items():
-            if not (math.isfinite(low) and math.isfinite(high)):
-                raise RigError(f"limits.{role} is ({low}, {high}); a rig file holds both ends or none. Give both")
-        inside = ", ".join(f"{role} = [{low!r}, {high!r}]" for role, (low, high) in given.items())
-        lines += [f"limits = {{ {inside} }}"] if inside else []
-    for speed, law in loop.laws[1:]:
-        lines += ["", "[[loop.laws]]", f'speed = {{ value = {speed!r}, unit = "rad/s" }}', *_law_lines(law)]
+    law: dict[str, object] = {name: getattr(loop, name) for name in ("kp", "ki", "kd", "kc")}
+    if loop.law is not None:
+        law = {"rate_hz": loop.law.rate_hz, **_law_entries(loop.law)}
+    intervals = {}
+    for role in ("voltage", "current", "position") if limits is not None else ():
+        low, high = getattr(limits, role)
+        if (low, high) == UNLIMITED:
+            continue
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise RigError(f"limits.{role} is ({low}, {high}); a rig file holds both ends or none. Give both")
+        intervals[role] = (low, high)
+    entries = {
+        "kind": "pid" if loop.law is None else "state-space", **law,
+        "derivative_cutoff_hz": loop.derivative_cutoff_hz if math.isfinite(loop.derivative_cutoff_hz) else None,
+        "delay": loop.delay, "limits": intervals or None,
+    }  # fmt: skip
+    lines = ["[loop]", *toml_lines(entries)]
+    for speed, other in loop.laws[1:]:
+        lines += ["", "[[loop.laws]]", *toml_lines({"speed": _quantity(speed, "rad/s"), **_law_entries(other)})]
     return lines
-
-
-def _noise_lines(noise: Noise) -> list[str]:
-    lines = ["[noise]", *(f"{name} = {getattr(noise, name)!r}" for name in ("position", "current", "force", "voltage"))]
-    steps = {role: getattr(noise, f"{role}_resolution") for role in ("position", "current", "voltage")}
-    inside = ", ".join(f"{role} = {step!r}" for role, step in steps.items() if step)
-    return [*lines, f"resolutions = {{ {inside} }}"] if inside else lines
-
-
-def layout_line(layout: Mapping[str, str]) -> str:
-    """Return the line of ``[record]`` that tells the layout of files."""
-    return f"layout = {{ {', '.join(f'{key} = {toml_text(value)}' for key, value in layout.items())} }}"
-
-
-def _record_lines(record: RecordSettings) -> list[str]:
-    lines = ["[record]"]
-    numbers = {"rate_hz": record.rate_hz, "rate_sd": record.rate_sd, "from": record.from_s, "to": record.to_s}
-    lines += [f"{key} = {value!r}" for key, value in numbers.items() if value is not None]
-    lines += [f'gaps = "{record.gaps}"'] if record.gaps else []
-    if record.time is not None:
-        lines.append(f"time = {{ variable = {toml_text(record.time[0])}, unit = {toml_text(record.time[1])} }}")
-    lines += [layout_line(record.layout)] if record.layout else []
-    return lines
-
-
-def _daq_lines(daq: Daq) -> list[str]:
-    lines = ["[daq]", f"rate_hz = {daq.rate_hz!r}", f"baud = {daq.baud}"]
-    lines += [f"duty = [{daq.duty[0]}, {daq.duty[1]}]"] if daq.duty else []
-    lines += [f"duty_off = {daq.duty_off}"] if daq.duty_off is not None else []
-    lines += [f"host_ms = {daq.host_ms}", f"lift_ms = {daq.lift_ms}"]
-    lines += [f"third = {toml_text(daq.third)}"] if daq.third else []
-    lines += [f"bench = {toml_text(daq.bench)}"] if daq.bench else []
-    trips = {"position": daq.position_trip, "current": daq.current_trip}
-    inside = ", ".join(f"{role} = [{x[0]!r}, {x[1]!r}]" for role, x in trips.items() if x is not None)
-    return [*lines, f"trip = {{ {inside} }}"] if inside else lines

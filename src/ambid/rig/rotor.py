@@ -237,20 +237,6 @@ def shaft_of(entry: ShaftEntry, parameters: Sequence[Parameter], where: str) -> 
     return shaft
 
 
-def shaft_lines(shaft: Shaft) -> list[str]:
-    """Return a shaft as lines of TOML, in SI units."""
-    lines = ["[shaft]", f"z = {_quantity(shaft.z, 'm')}", f"material = {_material_text(shaft.material)}"]
-    lines += [f"damping = {list(shaft.zeta)}"] if shaft.zeta else []
-    for step in shaft.steps:
-        sizes = {"length": step.length, "diameter": step.diameter} | ({"bore": step.bore} if step.bore else {})
-        lines += ["[[shaft.steps]]", *(f"{name} = {_quantity(size, 'm')}" for name, size in sizes.items())]
-        lines += [f"material = {_material_text(step.material)}"] if step.material else []
-    for disc in shaft.discs:
-        lines += ["[[shaft.discs]]", f"z = {_quantity(disc.z, 'm')}"]
-        lines += [f"{name} = {_quantity(getattr(disc, name), _DISC[name])}" for name in ("m", "Id", "Ip")]
-    return lines
-
-
 def _material(entry: MaterialEntry, place: str) -> Material:
     return Material(E=si_of(entry.E, "Pa", f"{place}.E"), rho=si_of(entry.rho, "kg/m^3", f"{place}.rho"), nu=entry.nu)
 
@@ -282,15 +268,6 @@ def _disc(entry: DiscEntry, material: Material, place: str) -> Disc:
         f"{place} has {', '.join(sizes) or 'a plane alone'}; a disc has m, or m, Id and Ip, or outer and width (and "
         "inner, rho). Give one of these sets"
     )
-
-
-def _quantity(value: float, unit: str) -> str:
-    return f'{{ value = {value!r}, unit = "{unit}" }}'
-
-
-def _material_text(material: Material) -> str:
-    E, rho = _quantity(material.E, "Pa"), _quantity(material.rho, "kg/m^3")
-    return f"{{ E = {E}, rho = {rho}, nu = {material.nu!r} }}"
 
 
 def unit_of(text: str, place: str) -> Unit:
