@@ -5,7 +5,7 @@ Anything else that escapes is a defect of the program.
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 class AmbidError(Exception):
@@ -59,6 +59,12 @@ def nearest(word: object, known: Sequence[str]) -> str:
     held = [k for k in close if written in k or k in written]  # of equally close words one that holds the other
     best = (*turned, *begun, *held, *close)
     return f" Did you mean {best[0]!r}?" if best else ""
+
+
+def choices(word: object, known: Iterable[str]) -> str:
+    """Return what may be written and which of it was meant: ``a, b. Did you mean 'a'?``, for the end of a message."""
+    words = list(known)
+    return f"{', '.join(words)}.{nearest(word, words)}"
 
 
 def counted(n: float | str, noun: str) -> str:

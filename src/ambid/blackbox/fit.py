@@ -23,7 +23,7 @@ from ambid.blackbox.model import (
     TransferModel,
     pole_covariance,
 )
-from ambid.errors import EstimationError, ModelError, nearest
+from ambid.errors import EstimationError, ModelError, choices
 from ambid.estimation.estimate import (
     FittedModel,
     covariance_together,
@@ -182,8 +182,7 @@ def structure(name: str) -> Structure:
             f"structure {name} is fitted to a frequency response, not to inputs and outputs. Use 'ambid frf'"
         )
     if name not in STRUCTURES:
-        names = ", ".join(STRUCTURES)
-        raise EstimationError(f"structure {name!r} is unknown; known: {names}.{nearest(name, list(STRUCTURES))}")
+        raise EstimationError(f"structure {name!r} is unknown; known: {choices(name, STRUCTURES)}")
     return STRUCTURES[name]
 
 

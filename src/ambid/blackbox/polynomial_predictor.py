@@ -28,7 +28,7 @@ from ambid.blackbox.data import (
 )
 from ambid.blackbox.fit import structure
 from ambid.blackbox.model import PolynomialModel, Polynomials
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, choices
 
 Key = tuple[str, int | None]
 
@@ -195,9 +195,7 @@ def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, flo
     places: list[dict[int, float]] = [{} for _ in layouts]
     for key, value in fixed.items():
         if key not in free:
-            raise EstimationError(
-                f"{name}: no coefficient {key!r} can be fixed; there are {', '.join(free)}.{nearest(key, list(free))}"
-            )
+            raise EstimationError(f"{name}: no coefficient {key!r} can be fixed; there are {choices(key, free)}")
         if not np.isfinite(value):
             raise EstimationError(f"{name}: coefficient {key} is fixed at {value}; it must be a finite number")
         o, place = free[key]

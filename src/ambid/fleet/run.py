@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import AmbidError, nearest
+from ambid.errors import AmbidError, choices
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, Done, cores, work
@@ -108,9 +108,7 @@ def function_of(job: Job) -> Callable[..., Any]:
     if not isinstance(job, str):
         return job
     if job not in JOBS:
-        raise AmbidError(
-            f"{setting('job', job)} is unknown; jobs are {', '.join(JOBS)}.{nearest(job, JOBS)} Correct it"
-        )
+        raise AmbidError(f"{setting('job', job)} is unknown; jobs are {choices(job, JOBS)} Correct it")
     function: Callable[..., Any] = getattr(import_module("ambid.job"), job)
     return function
 
@@ -123,9 +121,7 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
         takes = [name for name in parameters if name not in _OWN]
         for name in settings:
             if name not in takes:
-                raise AmbidError(
-                    f"{job} takes no {name!r}; it takes {', '.join(takes)}.{nearest(name, takes)} Correct it"
-                )
+                raise AmbidError(f"{job} takes no {name!r}; it takes {choices(name, takes)} Correct it")
         lacks = [n for n in takes if n not in settings and parameters[n].default is inspect.Parameter.empty]
         if lacks:
             raise AmbidError(f"{job} needs {lacks[0]}. Give {setting('set', f'{lacks[0]}=…')}")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, EstimationError, counted, nearest
+from ambid.errors import AmbidError, EstimationError, choices, counted, nearest
 from ambid.estimation.result import Reason, Result
 from ambid.ledger.entry import Note, tables
 from ambid.settings.caller import command
@@ -133,10 +133,8 @@ class History(Result):
 
     def __getitem__(self, name: str) -> Series:
         if name not in self.series:
-            names = list(self.series)
             raise EstimationError(
-                f"the history has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} "
-                "Check the name"
+                f"the history has no parameter {name!r}; it has {choices(name, self.series)} Check the name"
             )
         return self.series[name]
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, counted, nearest
+from ambid.errors import AmbidError, choices, counted, nearest
 from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.ledger.entry import moment
 from ambid.ledger.history import History, Series
@@ -248,7 +248,7 @@ def _rule(entry: Mapping[str, Any], where: str) -> Rule:
     keys = ("parameter", "change", "confidence", "since")
     for key in entry:
         if key not in keys:
-            raise AmbidError(f"{where}: {key!r} is unknown; known: {', '.join(keys)}.{nearest(key, keys)} Correct it")
+            raise AmbidError(f"{where}: {key!r} is unknown; known: {choices(key, keys)} Correct it")
     name, change = entry.get("parameter"), entry.get("change")
     if not isinstance(name, str) or not name:
         raise AmbidError(f'{where}: parameter must be a name such as "k_i". Give it')

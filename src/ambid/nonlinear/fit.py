@@ -23,7 +23,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, choices
 from ambid.estimation.estimate import FittedModel, fit_document, json_text, only_outputs, read_as, read_fit
 from ambid.estimation.search import Found
 
@@ -324,9 +324,8 @@ class _Rule:
         """Refuse what it may not be."""
         if self.options:
             if value not in self.options:
-                near = nearest(str(value), list(self.options))
                 raise EstimationError(
-                    f"{structure}: {name} is {value!r}; it must be one of {', '.join(self.options)}.{near}"
+                    f"{structure}: {name} is {value!r}; it must be one of {choices(value, self.options)}"
                 )
             return
         if self.name:
@@ -371,9 +370,7 @@ def read_settings(settings: type[S], structure: str, values: Mapping[str, object
     chosen: dict[str, object] = {}
     for name, value in values.items():
         if name not in allowed:
-            raise EstimationError(
-                f"{structure}: setting {name!r} is unknown; known: {', '.join(allowed)}.{nearest(name, list(allowed))}"
-            )
+            raise EstimationError(f"{structure}: setting {name!r} is unknown; known: {choices(name, allowed)}")
         if value == "auto" and default[name] is None:
             continue
         allowed[name].check(structure, name, value)
@@ -468,10 +465,7 @@ NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _EN
 def nonlinear_structure(name: str) -> NonlinearStructure:
     """Return a nonlinear structure of the register by name, such as ``"narmax"``."""
     if name not in NONLINEAR_STRUCTURES:
-        names = ", ".join(NONLINEAR_STRUCTURES)
-        raise EstimationError(
-            f"structure {name!r} is unknown; known: {names}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
-        )
+        raise EstimationError(f"structure {name!r} is unknown; known: {choices(name, NONLINEAR_STRUCTURES)}")
     return NONLINEAR_STRUCTURES[name]
 
 
@@ -557,6 +551,5 @@ def model_from_json(document: Mapping[str, Any]) -> NonlinearModel:
 
 def _home(kind: str) -> str:
     if kind not in MODEL_KINDS:
-        names = ", ".join(MODEL_KINDS)
-        raise EstimationError(f"model kind {kind!r} is unknown; known: {names}.{nearest(kind, list(MODEL_KINDS))}")
+        raise EstimationError(f"model kind {kind!r} is unknown; known: {choices(kind, MODEL_KINDS)}")
     return MODEL_KINDS[kind]

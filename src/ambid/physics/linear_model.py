@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import ModelError, nearest
+from ambid.errors import ModelError, choices
 
 Role = Literal["free", "fixed", "prior"]
 
@@ -137,9 +137,7 @@ class LinearModel(Protocol):
 def unknown_parameter(plant: LinearModel, parameter: str) -> ModelError:
     """Return the error for a parameter that a model does not have; it names the nearest."""
     names = [p.name for p in plant.parameters]
-    return ModelError(
-        f"model {plant.name!r} has no parameter {parameter!r}; it has {', '.join(names)}.{nearest(parameter, names)}"
-    )
+    return ModelError(f"model {plant.name!r} has no parameter {parameter!r}; it has {choices(parameter, names)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,9 +326,7 @@ def model(name: str) -> LinearModel:
         If there is none of that name; the message names the nearest.
     """
     if name not in _MODELS:
-        raise ModelError(
-            f"model {name!r} is unknown; known: {', '.join(_MODELS)}.{nearest(name, list(_MODELS))} See 'ambid models'"
-        )
+        raise ModelError(f"model {name!r} is unknown; known: {choices(name, _MODELS)} See 'ambid models'")
     return _MODELS[name]
 
 

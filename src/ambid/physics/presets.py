@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from ambid.errors import ModelError, nearest
+from ambid.errors import ModelError, choices
 from ambid.physics.loop import Limits, Loop, Noise, placed_loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
@@ -454,10 +454,7 @@ def preset(name: str) -> Preset:
         If there is none of that name; the message names the nearest.
     """
     if name not in _MAKERS:
-        names = list(_MAKERS)
-        raise ModelError(
-            f"preset {name!r} is unknown; known: {', '.join(names)}.{nearest(name, names)} Give one of them"
-        )
+        raise ModelError(f"preset {name!r} is unknown; known: {choices(name, _MAKERS)} Give one of them")
     return _MAKERS[name]()
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, RecordError, nearest
+from ambid.errors import AmbidError, RecordError, choices
 from ambid.settings.caller import LARGEST, setting
 
 if TYPE_CHECKING:
@@ -190,10 +190,7 @@ class Record:
         for c in self.channels:
             if c.name == name:
                 return c
-        raise RecordError(
-            f"the record has no channel {name!r}; it has {', '.join(self.names)}.{nearest(name, self.names)} Check the"
-            " name"
-        )
+        raise RecordError(f"the record has no channel {name!r}; it has {choices(name, self.names)} Check the name")
 
     @overload
     def __getitem__(self, key: str) -> Channel: ...

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import RecordError, UnitError, nearest
+from ambid.errors import RecordError, UnitError, choices
 from ambid.record.frames import numbers
 from ambid.record.record import Channel, Record, Step, readable
 from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, agreed_rate, refuse_gaps, sample_uniformly, seconds
@@ -84,8 +84,7 @@ def chosen_group(path: Path, groups: Mapping[str, Sequence[str]], wanted: str | 
         )
     if wanted is not None and wanted not in groups:
         raise RecordError(
-            f"record {path} has no group {wanted!r}; it has {', '.join(groups)}.{nearest(wanted, list(groups))} "
-            "Correct layout group"
+            f"record {path} has no group {wanted!r}; it has {choices(wanted, groups)} Correct layout group"
         )
     return next(iter(groups)) if wanted is None else wanted
 
@@ -166,8 +165,7 @@ def _wanted(path: Path, streams: Sequence[Stream], layout: Mapping[str, str]) ->
         for name in names:
             if name not in all_names:
                 raise RecordError(
-                    f"record {path} has no channel {name!r}; it has {', '.join(all_names)}.{nearest(name, all_names)} "
-                    "Correct layout channels"
+                    f"record {path} has no channel {name!r}; it has {choices(name, all_names)} Correct layout channels"
                 )
         wanted = [s for s in streams if s.name in names or s.time]
     clocks = [s.name for s in wanted if s.time]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, choices
 from ambid.estimation.predictor import scales_for
 from ambid.physics.linear_model import LinearModel, StateSpace, discretise
 from ambid.physics.linear_model import model as model_named
@@ -119,9 +119,7 @@ def _check_names(
 ) -> None:
     for name in table:
         if name not in known:
-            raise EstimationError(
-                f"{what} names {name!r}; there are {', '.join(known)}.{nearest(name, list(known))} Correct the name"
-            )
+            raise EstimationError(f"{what} names {name!r}; there are {choices(name, known)} Correct the name")
     lacking = [name for name in known if complete and name not in table]
     if lacking:
         raise EstimationError(f"{what} lacks {', '.join(lacking)}; each needs a number. Give it")

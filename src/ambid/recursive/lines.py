@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, choices
 from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.physics.linear_model import model_names
 from ambid.settings.caller import setting
@@ -220,9 +220,7 @@ class Track(Result):
     def __getitem__(self, name: str) -> ParameterTrack:
         names = [] if not self.lines else [*self.lines[-1].parameters, *self.lines[-1].extra]
         if name not in names:
-            raise EstimationError(
-                f"the track has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
-            )
+            raise EstimationError(f"the track has no parameter {name!r}; it has {choices(name, names)} Check the name")
         kept = [(x.t, {**x.parameters, **x.extra}.get(name, _UNKNOWN)) for x in self.lines]
         last = kept[-1][1]
         return ParameterTrack(

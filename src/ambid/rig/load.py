@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from ambid.errors import ModelError, RecordError, RigError, UnitError, nearest
+from ambid.errors import ModelError, RecordError, RigError, UnitError, choices
 from ambid.physics.law import StateLaw
 from ambid.physics.law_magnet import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
@@ -190,10 +190,7 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     units, where = role_units(plant), f"rig {path}"
     for role in entries:
         if role not in units:
-            raise RigError(
-                f"{where}: unknown role [channels.{role}]; model {plant.name!r} has {', '.join(units)}."
-                f"{nearest(role, list(units))}"
-            )
+            raise RigError(f"{where}: unknown role [channels.{role}]; model {plant.name!r} has {choices(role, units)}")
     channels = []
     for role in units:
         if role in entries:
@@ -245,8 +242,7 @@ def _parameters(entries: Mapping[str, ParameterEntry], plant: LinearModel, where
     for name in entries:
         if name not in names:
             raise RigError(
-                f"{where}: unknown parameter {name!r} in [parameters]; model {plant.name!r} has {', '.join(names)}."
-                f"{nearest(name, names)}"
+                f"{where}: unknown parameter {name!r} in [parameters]; model {plant.name!r} has {choices(name, names)}"
             )
     return tuple(
         parameter_of(spec, entries[spec.name], f"{where}: parameters.{spec.name}")
@@ -270,10 +266,7 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
     values: dict[str, float] = {}
     for role, quantity in entry.items():
         if role not in units:
-            roles = ", ".join(units)
-            raise RigError(
-                f"{where}: unknown key {role!r} in [operating_point]; known: {roles}.{nearest(role, list(units))}"
-            )
+            raise RigError(f"{where}: unknown key {role!r} in [operating_point]; known: {choices(role, units)}")
         if quantity == "auto":
             continue
         values[role] = si_of(quantity, units[role], f"{where}: operating_point.{role}")
@@ -451,8 +444,7 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
             raise RigError(f"{place} is the linear model's too. Write it in [parameters]")
         if name not in specs:
             raise RigError(
-                f"{where}: unknown parameter {name!r} in [magnet.parameters]; a magnet has {', '.join(specs)}."
-                f"{nearest(name, list(specs))}"
+                f"{where}: unknown parameter {name!r} in [magnet.parameters]; a magnet has {choices(name, specs)}"
             )
         if name in NOT_NEGATIVE and given.value is not None and not _allowed(given.value, given.role):
             rule = "must not be negative" if given.value < 0 else "must be positive unless it is fixed"
@@ -600,8 +592,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
         if c.column not in record.names:
             raise RecordError(
                 f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
-                f" {', '.join(record.names)}."
-                f"{nearest(c.column, record.names)} Correct channels.{c.role}.column"
+                f" {choices(c.column, record.names)} Correct channels.{c.role}.column"
             )
     found = {c.role: _in_declared_unit(record.channel(c.column), c) for c in rig.channels}
     _refuse_swapped(found, wanted, rig)
@@ -621,7 +612,7 @@ def calibrated_column(record: Record, c: RigChannel, unit: str) -> Channel:
     if c.column not in record.names:
         raise RecordError(
             f"the record has no column {c.column!r} (needed by channels.{c.role}.sensors); it has"
-            f" {', '.join(record.names)}.{nearest(c.column, record.names)} Correct its column"
+            f" {choices(c.column, record.names)} Correct its column"
         )
     return _calibrated(_in_declared_unit(record.channel(c.column), c), c, unit)[0]
 

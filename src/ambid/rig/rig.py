@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from ambid.errors import RigError, nearest
+from ambid.errors import RigError, choices
 from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
@@ -328,11 +328,10 @@ class Rig:
         RigError
             If the rig has no such role.
         """
-        for c in self.channels:
-            if c.role == role:
-                return c
-        roles = [c.role for c in self.channels]
-        raise RigError(f"the rig has no channel {role!r}; it has {', '.join(roles)}.{nearest(role, roles)}")
+        by_role = {c.role: c for c in self.channels}
+        if role not in by_role:
+            raise RigError(f"the rig has no channel {role!r}; it has {choices(role, by_role)}")
+        return by_role[role]
 
     def trip(self, role: Literal["position", "current"]) -> Interval:
         """Return the interval outside which the controller goes to its safe state.
@@ -375,13 +374,10 @@ class Rig:
         RigError
             If the model has none of that name.
         """
-        for p in self.parameters:
-            if p.name == name:
-                return p
-        names = [p.name for p in self.parameters]
-        raise RigError(
-            f"model {self.model!r} has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)}"
-        )
+        by_name = {p.name: p for p in self.parameters}
+        if name not in by_name:
+            raise RigError(f"model {self.model!r} has no parameter {name!r}; it has {choices(name, by_name)}")
+        return by_name[name]
 
 
 def role_units(plant: LinearModel) -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
-from ambid.errors import RigError, nearest
+from ambid.errors import RigError, choices, nearest
 from ambid.record.record import file_bytes, utf8_text
 
 SCHEMA = "ambid.rig/1"
@@ -360,7 +360,7 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
         *table, key = keys
         own = list(_keys(_entry_at(table)))
         inside = f"in [{'.'.join(table)}]" if table else "at the top"
-        return f"unknown key {key!r} {inside}; known: {', '.join(own)}.{nearest(key, own)}"
+        return f"unknown key {key!r} {inside}; known: {choices(key, own)}"
     if kind == "missing" and keys[-1] != "duty" and "limits" not in keys[:-1] and "trip" not in keys[:-1]:
         return f"{place} is missing. Add it"
     got = error["input"]

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ambid.arrays import Array, Complex
-from ambid.errors import RecordError, UnitError, nearest
+from ambid.errors import RecordError, UnitError, choices
 from ambid.record.csv_dialect import decoded, recognised
 from ambid.record.frames import label_of
 from ambid.record.record import check_rate, file_bytes, gunzipped, sha256_of
@@ -62,8 +62,8 @@ def read_response(
     for word in words:
         if word not in WORDS:
             raise RecordError(
-                f"{path}: layout {word!r} of a frequency response; it is one of {', '.join(WORDS)}."
-                f"{nearest(word, WORDS)} Correct or omit it"
+                f"{path}: layout {word!r} of a frequency response; it is one of {choices(word, WORDS)} Correct"
+                " or omit it"
             )
     if hold == "zoh" and rate_hz is None:
         raise RecordError(

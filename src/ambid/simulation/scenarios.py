@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypedDict, Unpack
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import ModelError, RecordError, nearest
+from ambid.errors import ModelError, RecordError, choices
 from ambid.physics.presets import Preset
 from ambid.record import write_record
 from ambid.record.record import Channel, Record, Step
@@ -184,10 +184,7 @@ def scenario_names() -> tuple[str, ...]:
 def scenario(name: str) -> Scenario:
     """Return the scenario called `name`."""
     if name not in SCENARIOS:
-        names = list(SCENARIOS)
-        raise ModelError(
-            f"scenario {name!r} is unknown; known: {', '.join(names)}.{nearest(name, names)} Give one of them"
-        )
+        raise ModelError(f"scenario {name!r} is unknown; known: {choices(name, SCENARIOS)} Give one of them")
     return SCENARIOS[name]
 
 

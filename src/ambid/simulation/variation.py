@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import ModelError, nearest
+from ambid.errors import ModelError, choices
 from ambid.physics.linear_model import LinearModel, discretise
 from ambid.simulation.plant import Equations
 
@@ -230,8 +230,8 @@ def check_variation(variation: Variation, model: LinearModel) -> None:
     for name, schedule in variation.parameters.items():
         if name not in specs:
             raise ModelError(
-                f"model {model.name!r} has no parameter {name!r} that could vary; it has {', '.join(specs)}."
-                f"{nearest(name, list(specs))} Correct the variation"
+                f"model {model.name!r} has no parameter {name!r} that could vary; it has {choices(name, specs)}"
+                " Correct the variation"
             )
         if specs[name].positive and min(schedule.values) <= 0.0:
             raise ModelError(
@@ -241,8 +241,8 @@ def check_variation(variation: Variation, model: LinearModel) -> None:
     for name in variation.gains:
         if name not in model.outputs:
             raise ModelError(
-                f"model {model.name!r} has no sensor of {name!r}; it has {', '.join(model.outputs)}."
-                f"{nearest(name, list(model.outputs))} Correct the variation"
+                f"model {model.name!r} has no sensor of {name!r}; it has {choices(name, model.outputs)} Correct the"
+                " variation"
             )
     if (variation.force is not None or variation.unbalance is not None) and "force" not in model.disturbances:
         raise ModelError(f"model {model.name!r} has no rotor that a force could act on. Leave force and unbalance out")
