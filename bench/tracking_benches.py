@@ -88,7 +88,6 @@ def second_bench() -> TrackBench:
         noise=Noise.held(rate_hz=RATE, position=2e-7, current=2e-3, force=2.0, voltage=0.05),
         limits=Limits(),
         rate_hz=RATE,
-        sources=MappingProxyType({}),
     )
 
     def stream(scenario: str, seed: int, seconds: float, at_s: float) -> Iterator[tuple[int, Samples]]:

@@ -49,7 +49,6 @@ def _light() -> Preset:
         noise=Noise.held(rate_hz=10e3, position=1e-7, current=1e-3, force=0.2, voltage=0.03),
         limits=Limits(),
         rate_hz=10e3,
-        sources=MappingProxyType({}),
     )
 
 
