@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ambid.physics.coenergy_law import law_numbers
@@ -12,7 +13,7 @@ from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.magnet import CoEnergy
 from ambid.physics.nonlinear import NonlinearPlant
-from ambid.physics.presets import Preset, RotorBody
+from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record
 from ambid.rig.rig import (
     OPTIONAL_ROLES,
@@ -217,59 +218,41 @@ def rig_of_preset(bench: Preset) -> Rig:
     Rig
         Columns are called like the roles; ``[magnet]`` stands there if the preset has a nonlinear plant.
     """
-    if bench.rotor is not None:
-        return _rig_of_rotor(bench, bench.rotor)
-    plant = model(bench.model)
-    point = {"position": bench.operating_point.position, "current": bench.operating_point.current,
-             "voltage": bench.operating_point.voltage}  # fmt: skip
-    return Rig(
+    body, rotor = bench.rotor, None if bench.rotor is None else bench.rotor.model.with_modes(0)
+    plant: LinearModel = model(bench.model) if rotor is None else rotor
+    roles, fixed = [*plant.inputs, *plant.outputs], _FIXED
+    if rotor is not None:
+        roles += ["angle"] if rotor.speed else []
+        roles += [f"{axis}_reference" for axis in rotor.axes]
+        fixed = frozenset({*rotor.places, *(p.name for p in rotor.parameters if p.name.endswith(".sensor_pole"))})
+    values = {**{p.name: p.default for p in plant.parameters}, **bench.parameters}
+    rig = Rig(
         name=bench.summary,
         model=bench.model,
-        channels=tuple(
-            RigChannel(role=role, column=role, delay="auto" if role in plant.inputs else 0)
-            for role in (*plant.inputs, *plant.outputs)
+        channels=tuple(RigChannel(role=r, column=r, delay="auto" if r in plant.inputs else 0) for r in roles),
+        parameters=tuple(
+            Parameter(name=p.name, unit=p.unit, value=values[p.name], role="fixed" if p.name in fixed else "free")
+            for p in plant.parameters
         ),
-        parameters=tuple(_parameter(s.name, s.unit, bench.parameters[s.name]) for s in plant.parameters),
-        magnet=None if bench.plant is None else _magnet(bench.plant),
-        operating_point=point if any(point.values()) else {},
         loop=bench.loop,
         limits=bench.limits,
         noise=bench.noise,
         record=RecordSettings(rate_hz=bench.rate_hz),
         open_loop=not bench.usually_closed,
     )
-
-
-def _rig_of_rotor(bench: Preset, body: RotorBody) -> Rig:
-    plant = body.model.with_modes(0)
-    values = {**{p.name: p.default for p in plant.parameters}, **bench.parameters}
-    known = {*plant.places, *(p.name for p in plant.parameters if p.name.endswith(".sensor_pole"))}
-    turning = ("angle",) if plant.speed else ()
-    roles = (*plant.inputs, *plant.outputs, *turning, *(f"{axis}_reference" for axis in plant.axes))
+    if body is None:
+        point = bench.operating_point._asdict()
+        magnet = None if bench.plant is None else _magnet(bench.plant)
+        return replace(rig, magnet=magnet, operating_point=point if any(point.values()) else {})
     numbers = {"s": body.gap, **({"sigma": body.sigma} if body.sigma else {})}
     specs = {spec.name: spec for spec in BEARING_NUMBERS}
-    return Rig(
-        name=bench.summary,
-        model=bench.model,
-        channels=tuple(RigChannel(role=r, column=r, delay="auto" if r in plant.inputs else 0) for r in roles),
-        rotor=plant,
-        parameters=tuple(
-            Parameter(name=p.name, unit=p.unit, value=values[p.name], role="fixed" if p.name in known else "free")
-            for p in plant.parameters
-        ),
+    return replace(
+        rig, rotor=rotor, shaft=body.shaft, unbalance=body.unbalance, runout=body.runout,
         modes=RigModes(count=body.model.n_modes or None) if body.shaft else RigModes(),
-        shaft=body.shaft,
-        unbalance=body.unbalance,
-        runout=body.runout,
         magnet=RigMagnet(
             kind="pair", gap="hyperbolic", saturation=True if body.sigma else None, cone=body.cone,
             parameters=tuple(Parameter(name=n, unit=specs[n].unit, value=x, role="fixed") for n, x in numbers.items()),
         ),
-        loop=bench.loop,
-        limits=bench.limits,
-        noise=bench.noise,
-        record=RecordSettings(rate_hz=bench.rate_hz),
-        open_loop=not bench.usually_closed,
     )  # fmt: skip
 
 
@@ -307,12 +290,8 @@ def _magnet(plant: NonlinearPlant) -> RigMagnet | None:
         rise=False,
         eddy=math.isfinite(plant.eddy_pole),
         parameters=tuple(
-            _parameter(s.name, s.unit, numbers[s.name])
+            Parameter(name=s.name, unit=s.unit, value=numbers[s.name], role="fixed" if s.name in _FIXED else "free")
             for s in BEARING_NUMBERS
             if s.name in numbers and s.name not in left_out
         ),
     )
-
-
-def _parameter(name: str, unit: str, value: float) -> Parameter:
-    return Parameter(name=name, unit=unit, value=value, role="fixed" if name in _FIXED else "free")
