@@ -77,102 +77,59 @@ class Structure:
         return function
 
 
-def _register(kind: Kind, module: str, *rows: tuple[str, str, Feedback, str]) -> dict[str, Structure]:
-    """Enter structures of one module: name, orders, what feedback does, summary."""
+def _register(*rows: tuple[str, Kind, str, str, Feedback, str]) -> Mapping[str, Structure]:
+    """Enter structures: name, kind, module, orders, what feedback does, summary."""
     return {
         name: Structure(
             name=name, summary=summary, orders=tuple(orders.split()), module=module, feedback=feedback, kind=kind
         )
-        for name, orders, feedback, summary in rows
+        for name, kind, module, orders, feedback, summary in rows
     }
 
 
-STRUCTURES: Mapping[str, Structure] = {
-    **_register(
-        "polynomial",
-        "polynomial",
-        ("fir", "nb nk", "biased", "y = B u + e"),
-        ("arx", "na nb nk", "with noise model", "A y = B u + e"),
-        ("armax", "na nb nc nk", "with noise model", "A y = B u + C e"),
-        ("arma", "na nc", "with noise model", "A y = C e"),
-        ("ararx", "na nb nd nk", "with noise model", "A y = B u + 1/D e"),
-        ("ararmax", "na nb nc nd nk", "with noise model", "A y = B u + C/D e"),
-        ("oe", "nb nf nk", "biased", "y = B/F u + e"),
-        ("bj", "nb nc nd nf nk", "with noise model", "y = B/F u + C/D e"),
-    ),
-    **_register(
-        "polynomial",
-        "instrumental",
-        ("iv4", "na nb nk", "biased", "A y = B u + noise of any colour"),
-        ("cliv", "na nb nk", "consistent", "A y = B u + noise of any colour, in closed loop with its reference"),
-    ),
-    **_register(
-        "transfer function",
-        "instrumental_continuous",
-        ("srivc", "nb nf nk", "biased", "y = B(s)/F(s) u + noise, continuous time"),
-        ("clsrivc", "nb nf nk", "consistent", "y = B(s)/F(s) u + noise, in closed loop with its reference"),
-    ),
-    **_register(
-        "state space",
-        "subspace",
-        ("n4sid", "n", "biased", "x+ = A x + B u + K e, subspace by oblique projection"),
-        ("moesp", "n", "biased", "x+ = A x + B u + K e, subspace, past without future inputs"),
-        ("cva", "n", "biased", "x+ = A x + B u + K e, subspace by canonical variates"),
-        (
-            "pbsid",
-            "n",
-            "consistent",
-            "x+ = A x + B u + K e, subspace from a long autoregression; consistent in closed loop",
-        ),
-    ),
-    **_register(
-        "state space",
-        "state_space_search",
-        ("sspem", "n", "with noise model", "x+ = A x + B u + K e by prediction error: statistically efficient"),
-    ),
-    **_register(
-        "polynomial",
-        "impulse",
-        ("rfir", "nb nk", "biased", "y = B u + e, many taps with a decaying prior"),
-        ("correlation", "nb nk", "biased", "y = B u + e, taps by correlation with the whitened input"),
-    ),
-    **_register(
-        "transfer function",
-        "blocks",
-        (
-            "blocks",
-            "nk",
-            "consistent",
-            "i = K_a/(s+a) u + K_b/(s+b) x, x = K_c/(s+c) i, continuous time (mass 1, no inertia)",
-        ),
-    ),
-    **_register(
-        "transfer function",
-        "weak_form",
-        ("weakform", "nb nf nk", "biased", "y = B(s)/F(s) u + white noise, continuous time, by test functions"),
-    ),
-}
+_INNOVATIONS = "x+ = A x + B u + K e"
+
+STRUCTURES = _register(
+    ("fir", "polynomial", "polynomial", "nb nk", "biased", "y = B u + e"),
+    ("arx", "polynomial", "polynomial", "na nb nk", "with noise model", "A y = B u + e"),
+    ("armax", "polynomial", "polynomial", "na nb nc nk", "with noise model", "A y = B u + C e"),
+    ("arma", "polynomial", "polynomial", "na nc", "with noise model", "A y = C e"),
+    ("ararx", "polynomial", "polynomial", "na nb nd nk", "with noise model", "A y = B u + 1/D e"),
+    ("ararmax", "polynomial", "polynomial", "na nb nc nd nk", "with noise model", "A y = B u + C/D e"),
+    ("oe", "polynomial", "polynomial", "nb nf nk", "biased", "y = B/F u + e"),
+    ("bj", "polynomial", "polynomial", "nb nc nd nf nk", "with noise model", "y = B/F u + C/D e"),
+    ("iv4", "polynomial", "instrumental", "na nb nk", "biased", "A y = B u + noise of any colour"),
+    ("cliv", "polynomial", "instrumental", "na nb nk", "consistent",
+     "A y = B u + noise of any colour, in closed loop with its reference"),
+    ("srivc", "transfer function", "instrumental_continuous", "nb nf nk", "biased",
+     "y = B(s)/F(s) u + noise, continuous time"),
+    ("clsrivc", "transfer function", "instrumental_continuous", "nb nf nk", "consistent",
+     "y = B(s)/F(s) u + noise, in closed loop with its reference"),
+    ("n4sid", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace by oblique projection"),
+    ("moesp", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace, past without future inputs"),
+    ("cva", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace by canonical variates"),
+    ("pbsid", "state space", "subspace", "n", "consistent",
+     f"{_INNOVATIONS}, subspace from a long autoregression; consistent in closed loop"),
+    ("sspem", "state space", "state_space_search", "n", "with noise model",
+     f"{_INNOVATIONS} by prediction error: statistically efficient"),
+    ("rfir", "polynomial", "impulse", "nb nk", "biased", "y = B u + e, many taps with a decaying prior"),
+    ("correlation", "polynomial", "impulse", "nb nk", "biased",
+     "y = B u + e, taps by correlation with the whitened input"),
+    ("blocks", "transfer function", "blocks", "nk", "consistent",
+     "i = K_a/(s+a) u + K_b/(s+b) x, x = K_c/(s+c) i, continuous time (mass 1, no inertia)"),
+    ("weakform", "transfer function", "weak_form", "nb nf nk", "biased",
+     "y = B(s)/F(s) u + white noise, continuous time, by test functions"),
+)  # fmt: skip
 
 # Fitted to a measured frequency response (`FrequencyResponse`) instead of to inputs and outputs: their estimators take
 # one in the place of the data, so they are kept apart from those that `fit` and `compare` can call. They are consistent
 # under feedback as far as the response is; that says itself where it is not.
-RESPONSE_STRUCTURES: Mapping[str, Structure] = {
-    **_register(
-        "transfer function",
-        "frequency",
-        ("frf-ml", "nb nf", "consistent", "G = N/D exp(-s delay), in s or z, by maximum likelihood"),
-    ),
-    **_register(
-        "state space",
-        "frequency_subspace",
-        (
-            "frf-subspace",
-            "n",
-            "consistent",
-            "x' = A x + B u by subspace with the Laguerre operator, then maximum likelihood",
-        ),
-    ),
-}
+RESPONSE_STRUCTURES = _register(
+    ("frf-ml", "transfer function", "frequency", "nb nf", "consistent",
+     "G = N/D exp(-s delay), in s or z, by maximum likelihood"),
+    ("frf-subspace", "state space", "frequency_subspace", "n", "consistent",
+     "x' = A x + B u by subspace with the Laguerre operator, then maximum likelihood"),
+)  # fmt: skip
 
 
 def structure(name: str) -> Structure:

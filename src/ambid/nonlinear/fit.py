@@ -380,86 +380,39 @@ def read_settings(settings: type[S], structure: str, values: Mapping[str, object
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NonlinearStructure:
-    """One nonlinear structure."""
+    """One nonlinear structure, which a noise model makes consistent under feedback as long as it holds the true one; a
+    module of `ambid.nonlinear` of its name has its estimator and its settings.
+    """
 
     name: str  # for lists
     summary: str
-    options: str  # ``module:class`` of its settings
-    home: str  # ``module:function`` of its estimator
-    # what feedback does to it: nothing; bias; nothing as long as its noise model holds the true one
-    feedback: Literal["consistent", "biased", "with noise model"]
+    feedback: Literal["consistent", "biased", "with noise model"] = "with noise model"  # what that does to it
 
     @property
     def estimator(self) -> Callable[..., NonlinearFit]:
         """The function that fits it."""
-        function: Callable[..., NonlinearFit] = _load(self.home)
+        function: Callable[..., NonlinearFit] = getattr(import_module(f"ambid.nonlinear.{self.name}"), self.name)
         return function
 
     @property
     def settings(self) -> Mapping[str, str]:
         """Settings by name, each with a line that says what it is and what is chosen without it."""
-        return {name: rule.says for name, rule in rules(_load(self.options)).items()}
+        own = getattr(import_module(f"ambid.nonlinear.{self.name}"), f"{self.name.capitalize()}Settings")
+        return {name: rule.says for name, rule in rules(own).items()}
 
 
-def _load(home: str) -> Any:
-    """What ``module:name`` says."""
-    module, name = home.split(":")
-    return getattr(import_module(module), name)
-
-
-_ENTRIES: tuple[NonlinearStructure, ...] = (
-    NonlinearStructure(
-        name="narmax",
-        summary="polynomial or rational difference equation; terms by orthogonal least squares; noise model",
-        options="ambid.nonlinear.narmax_choice:NarmaxSettings",
-        home="ambid.nonlinear.narmax:narmax",
-        feedback="with noise model",
-    ),
-    NonlinearStructure(
-        name="nn",
-        summary="state-space network whose weights are A and B (thesis fig. 5.9), with a network G(x, u)",
-        options="ambid.nonlinear.nn:NnSettings",
-        home="ambid.nonlinear.nn:nn",
-        feedback="with noise model",
-    ),
-    NonlinearStructure(
-        name="narx",
-        summary="neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
-        options="ambid.nonlinear.narx:NarxSettings",
-        home="ambid.nonlinear.narx:narx",
-        feedback="with noise model",
-    ),
-    NonlinearStructure(
-        name="lpv",
-        summary="linear model whose coefficients follow a scheduling signal such as the set point; error model",
-        options="ambid.nonlinear.lpv:LpvSettings",
-        home="ambid.nonlinear.lpv:lpv",
-        feedback="with noise model",
-    ),
-    NonlinearStructure(
-        name="hybrid",
-        summary="polynomial, network for its residual, noise model C (thesis eqs 3.23-3.24)",
-        options="ambid.nonlinear.hybrid:HybridSettings",
-        home="ambid.nonlinear.hybrid:hybrid",
-        feedback="with noise model",
-    ),
-    NonlinearStructure(
-        name="hammerstein",
-        summary="static polynomial of each input, then a linear difference equation",
-        options="ambid.nonlinear.hammerstein:HammersteinSettings",
-        home="ambid.nonlinear.hammerstein:hammerstein",
-        feedback="with noise model",
-    ),
-    NonlinearStructure(
-        name="rbf",
-        summary="radial basis functions of lagged outputs and inputs, with a linear part (thesis eqs 1.13-1.14)",
-        options="ambid.nonlinear.rbf:RbfSettings",
-        home="ambid.nonlinear.rbf:rbf",
-        feedback="with noise model",
-    ),
-)
-
-NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _ENTRIES}
+NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {
+    name: NonlinearStructure(name=name, summary=summary)
+    for name, summary in {
+        "narmax": "polynomial or rational difference equation; terms by orthogonal least squares; noise model",
+        "nn": "state-space network whose weights are A and B (thesis fig. 5.9), with a network G(x, u)",
+        "narx": "neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
+        "lpv": "linear model whose coefficients follow a scheduling signal such as the set point; error model",
+        "hybrid": "polynomial, network for its residual, noise model C (thesis eqs 3.23-3.24)",
+        "hammerstein": "static polynomial of each input, then a linear difference equation",
+        "rbf": "radial basis functions of lagged outputs and inputs, with a linear part (thesis eqs 1.13-1.14)",
+    }.items()
+}
 
 
 def nonlinear_structure(name: str) -> NonlinearStructure:
