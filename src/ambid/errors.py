@@ -5,7 +5,8 @@ Anything else that escapes is a defect of the program.
 """
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 
 class AmbidError(Exception):
@@ -65,6 +66,15 @@ def choices(word: object, known: Iterable[str]) -> str:
     """Return what may be written and which of it was meant: ``a, b. Did you mean 'a'?``, for the end of a message."""
     words = list(known)
     return f"{', '.join(words)}.{nearest(word, words)}"
+
+
+@contextmanager
+def needs(package: str, what: str, extra: str) -> Iterator[None]:
+    """Refuse an import inside whose package is not installed: `what` needs it, and ``ambid[extra]`` brings it."""
+    try:
+        yield
+    except ImportError:
+        raise AmbidError(f"{package} is not installed, and {what} needs it. Install ambid[{extra}]") from None
 
 
 def counted(n: float | str, noun: str) -> str:

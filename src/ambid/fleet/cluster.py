@@ -12,7 +12,7 @@ from importlib import import_module
 from threading import Timer
 from typing import Any
 
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, needs
 from ambid.fleet.pool import Done, attempt, one_thread_each
 from ambid.settings.caller import Language, language, setting, speaking
 
@@ -37,10 +37,8 @@ def work_on_cluster(
 
     `scheduler`: its address, or the number of workers of a cluster on this machine.
     """
-    try:
+    with needs("Dask distributed", "a cluster", "fleet"):
         distributed: Any = import_module("distributed")
-    except ImportError:
-        raise AmbidError("Dask distributed is not installed, and a cluster needs it. Install ambid[fleet]") from None
     with _client(distributed, scheduler) as client:
         try:
             yield from _answers(distributed, client, job, iter(tasks), limit_s, stopped)

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ambid.errors import AmbidError, RecordError, counted
+from ambid.errors import AmbidError, RecordError, counted, needs
 from ambid.job.data import known_rig
 from ambid.ledger.entry import moment, sha_of
 from ambid.record import Record, Source, read_record
@@ -88,10 +88,8 @@ class Item:
 
 def _system(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, and its path there."""
-    try:
+    with needs("fsspec", url, "fleet"):
         from fsspec.core import url_to_fs
-    except ImportError:
-        raise AmbidError(f"fsspec is not installed, and {url} needs it. Install ambid[fleet]") from None
     try:
         system: tuple[Any, str] = url_to_fs(url)
     except (ImportError, ValueError) as failure:

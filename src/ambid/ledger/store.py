@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ambid.errors import AmbidError, counted
+from ambid.errors import AmbidError, counted, needs
 from ambid.estimation.result import Reason, Result
 from ambid.ledger import entry
 from ambid.settings.caller import setting
@@ -403,10 +403,8 @@ def open_ledger(where: str | Path, *, write: bool = True) -> Ledger:
     AmbidError
         If it cannot be opened, is no ledger, or one of a newer version; it is then left as it was.
     """
-    try:
+    with needs("SQLAlchemy", "a ledger", "fleet"):
         import sqlalchemy  # noqa: F401
-    except ImportError:
-        raise AmbidError("SQLAlchemy is not installed, and a ledger needs it. Install ambid[fleet]") from None
     text = str(where)
     engine, name = _server(text) if "://" in text else _file(Path(text), write=write)
     ledger = Ledger(engine, name)
@@ -434,10 +432,8 @@ def _server(url: str) -> tuple[Engine, str]:
             f"ledger {address.render_as_string()} is of {address.get_backend_name()!r}; it must be a file of SQLite or "
             "a URL postgresql://user@host/name. Correct it"
         )
-    try:
+    with needs("psycopg", "PostgreSQL", "postgres"):
         import psycopg  # noqa: F401
-    except ImportError:
-        raise AmbidError("psycopg is not installed, and PostgreSQL needs it. Install ambid[postgres]") from None
     return create_engine(address.set(drivername="postgresql+psycopg")), address.render_as_string()
 
 
@@ -604,10 +600,8 @@ _MADE = b"ambid.ledger"
 
 def export(c: Connection, folder: Path) -> tuple[str, ...]:
     """Write the tables; times as timestamps of UTC, names of bearings beside their numbers; documents are left out."""
-    try:
+    with needs("pyarrow", "Parquet", "formats"):
         import pyarrow.parquet as parquet
-    except ImportError:
-        raise AmbidError("pyarrow is not installed, and Parquet needs it. Install ambid[formats]") from None
     try:
         folder.mkdir(exist_ok=True)
         files = [folder / f"{name}.parquet" for name in _TABLES]

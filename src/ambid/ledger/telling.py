@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.errors import AmbidError, counted
+from ambid.errors import AmbidError, counted, needs
 from ambid.ledger.history import History
 from ambid.ledger.monitor import Watched
 from ambid.settings.caller import setting
@@ -34,12 +34,8 @@ def write_metrics(watched: Watched, path: str | Path) -> None:
     AmbidError
         If prometheus-client is not installed.
     """
-    try:
+    with needs("prometheus-client", setting("publish"), "metrics"):
         from prometheus_client import CollectorRegistry, Gauge, generate_latest
-    except ImportError:
-        raise AmbidError(
-            f"prometheus-client is not installed, and {setting('publish')} needs it. Install ambid[metrics]"
-        ) from None
     registry = CollectorRegistry()
 
     def gauge(name: str, says: str, *labels: str) -> Any:
@@ -84,13 +80,9 @@ def publish(watched: Watched, where: str) -> int:
     AmbidError
         If paho-mqtt is not installed, the address is none, or the broker does not take the messages.
     """
-    try:
+    with needs("paho-mqtt", setting("publish"), "mqtt"):
         from paho.mqtt.client import Client, MQTTv5
         from paho.mqtt.enums import CallbackAPIVersion
-    except ImportError:
-        raise AmbidError(
-            f"paho-mqtt is not installed, and {setting('publish')} needs it. Install ambid[mqtt]"
-        ) from None
     if "@" in where:
         raise AmbidError(
             f"{setting('publish')} takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead"
