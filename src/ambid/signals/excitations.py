@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from functools import partial
 from inspect import signature
 from math import ceil, log2
@@ -13,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, choices
 
 AmplitudeIs = Literal["peak", "rms"]
 
@@ -489,9 +488,7 @@ def excitation(
     allowed = [p for p in signature(function).parameters if p not in own]
     for option in options:
         if option not in allowed:
-            near = get_close_matches(option, allowed, n=1, cutoff=0.4)
-            hint = f"Did you mean {near[0]!r}?" if near else "Omit it"
-            raise AmbidError(f"excitation {name!r} has no option {option!r}; it has {', '.join(allowed)}. {hint}")
+            raise AmbidError(f"excitation {name!r} has no option {option!r}; it has {choices(option, allowed)} Omit it")
     settings: dict[str, object] = {"amplitude": amplitude, **options}
     if name == "steps":
         if band is not None:
@@ -508,6 +505,4 @@ def excitation(
 
 def _refuse_unknown(name: str, allowed: Sequence[str]) -> None:
     if name not in allowed:
-        near = get_close_matches(name, allowed, n=1, cutoff=0.4)
-        hint = f"Did you mean {near[0]!r}?" if near else "Give one of these"
-        raise AmbidError(f"excitation {name!r} is unknown; there are {', '.join(allowed)}. {hint}")
+        raise AmbidError(f"excitation {name!r} is unknown; there are {choices(name, allowed)} Give one of these")
