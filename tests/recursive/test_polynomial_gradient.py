@@ -63,7 +63,7 @@ def test_gradient_is_that_of_the_residual(name: str) -> None:
     )
     errors, psi, one = np.zeros(N), np.zeros((N, free.size)), np.zeros(1)
     for t in range(N):
-        run(u[t : t + 1], y[t : t + 1], one, False, *state.arrays())
+        run(u[t : t + 1], y[t : t + 1], one, False, state.arrays())
         errors[t] = one[0]
         columns = state.plan[state.meta[8] :][: free.size]  # row of the buffer, lag, sign
         psi[t] = columns[:, 2] * state.signals[columns[:, 0], state.count[0] - 1 - columns[:, 1]]

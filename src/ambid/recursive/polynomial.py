@@ -323,7 +323,7 @@ class RecursivePolynomial(Copied):
         return errors.reshape(shape)
 
     def _run(self, u: Array, y: Array, errors: Array, *, learn: bool = True) -> None:
-        kernels("polynomial").run(u, y, errors, learn, *self._arrays)
+        kernels("polynomial").run(u, y, errors, learn, self._arrays)
 
     def _with_window(self, window: _Window, u: Array, y: Array, errors: Array) -> int:
         """Store samples and fit them at fixed counts; return how many of the block were dealt with."""

@@ -81,12 +81,18 @@ def follow(plan: Table, meta: Table, theta: Array, coef: Array, work: Array) -> 
     return drawn
 
 
+# The arrays of a recursion, as `State.arrays` has them: plan, where its parts begin, counts, settings, coefficients,
+# those that filters take, factors of P, scores, limits of P, signals, and room for gradient, gain and a product
+Recursion = tuple[Table, Table, Table, Array, Array, Array, Array, Array, Array, Array, Array]
+
+
 @compiled
-def _wait(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table) -> None:
+def _wait(recursion: Recursion, t: int) -> None:
     """Take one more sample of history: noise counts as zero, so that the first w with a memory is what is left of A y,
     its error of the noise's size. Once it is long enough, ones stand for the unknown states of F and C: when their
     response is forgotten, the waiting ends.
     """
+    plan, meta, count, _, _, coef, _, _, _, s, _ = recursion
     count[_WAITED] += 1
     if count[_FILL] < meta[_LONGEST]:
         s[meta[_E], t] = 0.0
@@ -111,25 +117,12 @@ def _wait(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table)
 
 
 @compiled
-def _learn(
-    plan: Table,
-    meta: Table,
-    count: Table,
-    real: Array,
-    theta: Array,
-    coef: Array,
-    F: Array,
-    S: Array,
-    limit: Array,
-    s: Array,
-    t: int,
-    psi: Array,
-    gain: Array,
-    work: Array,
-) -> None:
+def _learn(recursion: Recursion, t: int) -> None:
     """Make one Gauss-Newton step (Ljung & Söderström 1983, sec. 3.4), from where the filters stand to where the data
     say: two places only while C or F would be unstable.
     """
+    plan, meta, count, real, theta, coef, F, S, limit, s, room = recursion
+    psi, gain, work = room[0, : theta.size], room[1, : theta.size], room[2, : theta.size]
     n, e = theta.size, s[meta[_E], t]
     for j in range(n):
         k = meta[_COLUMNS] + j
@@ -175,26 +168,10 @@ def _learn(
 
 
 @compiled
-def run(
-    u: Array,
-    y: Array,
-    errors: Array,
-    learn: bool,
-    plan: Table,
-    meta: Table,
-    count: Table,
-    real: Array,
-    theta: Array,
-    coef: Array,
-    F: Array,
-    S: Array,
-    limit: Array,
-    s: Array,
-    work: Array,
-) -> None:
+def run(u: Array, y: Array, errors: Array, learn: bool, recursion: Recursion) -> None:
     """Take in samples u (m, n_inputs), y (m,); write the errors of prediction; `learn` false leaves coefficients."""
-    longest, width, n = meta[_LONGEST], s.shape[1], theta.size
-    psi, gain, scratch = work[0, :n], work[1, :n], work[2, :n]
+    plan, meta, count, real, _, coef, _, _, _, s, _ = recursion
+    longest, width = meta[_LONGEST], s.shape[1]
     for k in range(y.size):
         errors[k] = np.nan
         t = count[_POS]
@@ -219,9 +196,9 @@ def run(
         count[_POS] = t + 1
         count[_USED] += 1
         if count[_FILL] < longest or count[_RINGING]:
-            _wait(plan, meta, coef, s, t, count)
+            _wait(recursion, t)
         else:
             errors[k] = e
             if learn:
-                _learn(plan, meta, count, real, theta, coef, F, S, limit, s, t, psi, gain, scratch)
+                _learn(recursion, t)
         filter_column(plan, meta, meta[_RESIDUAL], meta[_GRADIENT], coef, s, t)
