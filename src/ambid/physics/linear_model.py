@@ -140,8 +140,24 @@ def unknown_parameter(plant: LinearModel, parameter: str) -> ModelError:
     return ModelError(f"model {plant.name!r} has no parameter {parameter!r}; it has {choices(parameter, names)}")
 
 
+class _OnAxis:
+    """What models of one axis share."""
+
+    __slots__ = ()
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """SI units of inputs, outputs, states and disturbances."""
+        return UNITS
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return no scales: no parameter may be zero, unless a model says otherwise."""
+        del theta
+        return {}
+
+
 @dataclass(frozen=True, slots=True)
-class OneAxis:
+class OneAxis(_OnAxis):
     """Coil, magnet and mass on one axis (thesis eq. 4.4 and 4.8): m x'' = k_i i - k_x x - c x' + f, V = R i + L i' +
     k_i x'; position and current are measured (the printed C = [1 0 1]^T has to be two rows, theory.md sec. 1).
     """
@@ -153,11 +169,6 @@ class OneAxis:
     outputs: tuple[str, ...] = ("position", "current")
     states: tuple[str, ...] = ("position", "velocity", "current")
     disturbances: tuple[str, ...] = ("force", "voltage")
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """SI units of inputs, outputs, states and disturbances."""
-        return UNITS
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return A (3, 3), B (3, 1), E (3, 2), C (2, 3) of thesis eq. 4.8, damped; m, k_x, k_i, R, L, c in SI."""
@@ -200,7 +211,7 @@ class OneAxis:
 
 
 @dataclass(frozen=True, slots=True)
-class Coil:
+class Coil(_OnAxis):
     """Coil with the rotor at rest (thesis eq. 2.3 and 4.1): V = R i + L i'."""
 
     name: str = "coil"  # as in `LinearModel`
@@ -210,11 +221,6 @@ class Coil:
     outputs: tuple[str, ...] = ("current",)
     states: tuple[str, ...] = ("current",)
     disturbances: tuple[str, ...] = ("voltage",)
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """SI units of inputs, outputs, states and disturbances."""
-        return UNITS
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return A, B, E, C, each (1, 1), for R in ohm and L in H."""
@@ -236,14 +242,9 @@ class Coil:
             case _:
                 raise unknown_parameter(self, parameter)
 
-    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return no scales: neither R nor L may be zero."""
-        del theta
-        return {}
-
 
 @dataclass(frozen=True, slots=True)
-class Rotor:
+class Rotor(_OnAxis):
     """Mass on a current-driven magnet (thesis eq. 2.1, 2.14): m x'' = k_i i - k_x x - c x' + f. The current is the
     input, as with a transconductance amplifier; data show only ratios to m (theory.md sec. 1): fix it, or give a prior.
     """
@@ -255,11 +256,6 @@ class Rotor:
     outputs: tuple[str, ...] = ("position",)
     states: tuple[str, ...] = ("position", "velocity")
     disturbances: tuple[str, ...] = ("force",)
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """SI units of inputs, outputs, states and disturbances."""
-        return UNITS
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return A (2, 2), B (2, 1), E (2, 1), C (1, 2) of m, k_x, k_i, c in SI."""
