@@ -30,7 +30,7 @@ from ambid.blackbox.mode_starts import (
 )
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import Modal, TrialPole, assurance, mode_of, modes_checks, student
+from ambid.estimation.modes import Modal, OfPole, TrialPole, assurance, mode_of, modes_checks, student
 from ambid.estimation.result import NORMAL_95
 from ambid.estimation.search import Rows, search
 from ambid.settings.caller import setting
@@ -184,7 +184,7 @@ def _averaged(values: NDArray[np.inexact]) -> NDArray[np.inexact]:
 
 
 @dataclass(slots=True, eq=False)
-class _Candidate:
+class _Candidate(OfPole):
     """A pole in its window, with what speaks for it."""
 
     pole: complex
@@ -199,14 +199,6 @@ class _Candidate:
     shape_variance: Array = field(default_factory=lambda: np.zeros(0))
     likelihood: Array = field(default_factory=lambda: np.zeros((2, 2)))
     jackknife: Array = field(default_factory=lambda: np.zeros((2, 2)))
-
-    @property
-    def frequency_hz(self) -> float:
-        return abs(self.pole) / (2 * np.pi)
-
-    @property
-    def damping(self) -> float:
-        return -self.pole.real / abs(self.pole)
 
 
 def _half_width(pole: complex, step: float) -> float:

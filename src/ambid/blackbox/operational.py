@@ -23,6 +23,7 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import (
     Modal,
+    OfPole,
     PoleCluster,
     Tolerance,
     TrialPole,
@@ -64,7 +65,7 @@ class _Band:
 
 
 @dataclass(slots=True, eq=False)
-class _Found:
+class _Found(OfPole):
     """A mode of one band with what its stretches say."""
 
     pole: complex
@@ -72,10 +73,6 @@ class _Found:
     covariance: Array
     variance: Array
     steadiness: float
-
-    @property
-    def frequency_hz(self) -> float:
-        return abs(self.pole) / (2 * np.pi)
 
     @property
     def harmonic(self) -> bool:

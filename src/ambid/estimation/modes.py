@@ -25,12 +25,11 @@ def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
     return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoleCluster:
-    """A cluster of stable poles: a mode of the plant."""
+class OfPole:
+    """What follows from a pole in continuous time."""
 
-    pole: complex  # in continuous time, log(z)/dt; of a complex pair the one above the real axis; median of a cluster
-    orders: tuple[int, ...]  # models that show it
+    __slots__ = ()
+    pole: complex
 
     @property
     def frequency_hz(self) -> float:
@@ -41,6 +40,14 @@ class PoleCluster:
     def damping(self) -> float:
         """-Re(pole)/|pole|; negative for an unstable pole."""
         return -self.pole.real / abs(self.pole) if self.pole else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoleCluster(OfPole):
+    """A cluster of stable poles: a mode of the plant."""
+
+    pole: complex  # in continuous time, log(z)/dt; of a complex pair the one above the real axis; median of a cluster
+    orders: tuple[int, ...]  # models that show it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
