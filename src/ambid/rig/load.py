@@ -304,18 +304,16 @@ def _law(entry: LoopEntry | LawEntry, rate_hz: float) -> StateLaw:
 
 
 def _limits(entry: LimitsEntry, where: str) -> Limits:
-    intervals: dict[str, tuple[float, float]] = {}
-    for role in ("voltage", "current", "position"):
-        limits = getattr(entry, role)
-        if limits is None:
-            continue
-        low, high = limits if isinstance(limits, tuple) else (-limits, limits)
-        if not low < high:
-            raise RigError(
-                f"{where}: loop.limits.{role} is [{low}, {high}]; the lower comes first. Swap or correct them"
-            )
-        intervals[role] = (low, high)
-    return Limits(**intervals)
+    entries = {role: getattr(entry, role) for role in ("voltage", "current", "position")}
+    return Limits(**{r: _interval(x, f"{where}: loop.limits.{r}") for r, x in entries.items() if x is not None})
+
+
+def _interval(value: float | Interval, place: str) -> Interval:
+    """Return both ends of an interval, of which one number is half."""
+    low, high = value if isinstance(value, tuple) else (-value, value)
+    if not low < high:
+        raise RigError(f"{place} is [{low}, {high}]; the lower comes first. Swap or correct them")
+    return low, high
 
 
 def _noise(entry: NoiseEntry) -> Noise:
@@ -341,8 +339,8 @@ def daq_of(
     default of its rate.
     """
     place = f"{where}: daq"
-    if entry.duty is not None and not entry.duty[0] < entry.duty[1]:
-        raise RigError(f"{place}.duty is {list(entry.duty)}; the lower comes first. Swap or correct them")
+    if entry.duty is not None:
+        _interval(entry.duty, f"{place}.duty")
     if not _BAUD[0] <= entry.baud <= _BAUD[1]:
         raise RigError(
             f"{place}.baud is {entry.baud}; a serial line goes at {_BAUD[0]} to {_BAUD[1]} bit/s."
@@ -382,9 +380,7 @@ def _trip(
         return None
     if role not in plant.outputs and role not in plant.inputs:
         raise RigError(f"{place}.trip.{role} is given; model {plant.name!r} has no {role}. Remove it")
-    low, high = value if isinstance(value, tuple) else (-value, value)
-    if not low < high:
-        raise RigError(f"{place}.trip.{role} is [{low}, {high}]; the lower comes first. Swap or correct them")
+    low, high = _interval(value, f"{place}.trip.{role}")
     least, most = UNLIMITED if limits is None else getattr(limits, role)
     if low < least or high > most:
         raise RigError(
