@@ -181,42 +181,24 @@ class RotorModel:
         specs = [M, *((ID,) if radial else ()), *((IP,) if self.polar else ()), *((Z_CG,) if radial else ())]
         specs += [EDDY] if "a" in self.extras else []
         for j, axis in enumerate(self.axes):
-            specs += [
-                ParameterSpec(name=f"{axis}.k_i", unit="N/A", meaning=f"force–current factor of axis {axis}"),
-                ParameterSpec(
-                    name=f"{axis}.k_x", unit="N/m", meaning=f"position stiffness of axis {axis} (negative for a magnet)"
-                ),
+            rows = [
+                ("k_i", "N/A", f"force–current factor of axis {axis}", False),
+                ("k_x", "N/m", f"position stiffness of axis {axis} (negative for a magnet)", False),
             ]
             if j in self.coils:
-                specs += [
-                    ParameterSpec(
-                        name=f"{axis}.R", unit="ohm", meaning=f"coil resistance of axis {axis}", positive=True
-                    ),
-                    ParameterSpec(name=f"{axis}.L", unit="H", meaning=f"coil inductance of axis {axis}", positive=True),
-                ]
+                rows.append(("R", "ohm", f"coil resistance of axis {axis}", True))
+                rows.append(("L", "H", f"coil inductance of axis {axis}", True))
             if j in self.amplified:
-                gain, pole = f"{axis}.amplifier_gain", f"{axis}.amplifier_pole"
-                specs += [
-                    ParameterSpec(name=gain, unit="A/V", meaning=f"static gain of the amplifier of axis {axis}"),
-                    ParameterSpec(
-                        name=pole, unit="rad/s", meaning=f"pole of the amplifier of axis {axis}", positive=True
-                    ),
-                ]
+                rows.append(("amplifier_gain", "A/V", f"static gain of the amplifier of axis {axis}", False))
+                rows.append(("amplifier_pole", "rad/s", f"pole of the amplifier of axis {axis}", True))
             if f"{axis}.gain" in self.extras:
-                specs.append(
-                    ParameterSpec(
-                        name=f"{axis}.gain", unit="1", meaning=f"gain error of the position sensor of axis {axis}"
-                    )
-                )
+                rows.append(("gain", "1", f"gain error of the position sensor of axis {axis}", False))
             if self._pole(j):
-                specs.append(
-                    ParameterSpec(
-                        name=f"{axis}.sensor_pole",
-                        unit="rad/s",
-                        meaning=f"pole of the position sensor of axis {axis}",
-                        positive=True,
-                    )
-                )
+                rows.append(("sensor_pole", "rad/s", f"pole of the position sensor of axis {axis}", True))
+            specs += [
+                ParameterSpec(name=f"{axis}.{name}", unit=unit, meaning=meaning, positive=positive)
+                for name, unit, meaning, positive in rows
+            ]
         for b in self.bearings:
             if b.axial:
                 continue
