@@ -13,8 +13,9 @@ from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig
 from ambid.simulation import simulate_scenario
+from ambid.tracking.evidence import Evidence
 from ambid.tracking.numbers import amplitude_and_phase, forcing_of, tracked_numbers
-from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.rpem import DriftRates, ParameterFilter, PhysicalRpem
 from tests.bearing.benches import SETTINGS
 from tests.tracking.starts import BEARING, bearing, bearing_start, bench_record, bench_start, columns, signals
 
@@ -179,3 +180,44 @@ def test_a_joint_cause_of_one_number_alone_moves_nothing_together(monkeypatch):
     r.predict()
     assert np.array_equal(r.filter.q, before)
     sound(r)
+
+
+JOINT = np.array([1.0, 1.0, 0.0])
+
+
+def looks(slope, *, seed=1, from_=200, count=400):
+    """Numbers that stand still until chunk `from_`, then drift by `slope` a chunk, known by a filter that expects no
+    drift: after each chunk, where they are, how far they may have drifted, and where to.
+    """
+    rng, p, block_s = np.random.default_rng(seed), 3, 0.05
+    rates = np.full(p, 1e-9)
+    drift, known = DriftRates(rates, rates, 10.0 * rates, block_s), ParameterFilter(np.zeros(p), 1e-4 * np.eye(p))
+    found = []
+    for k in range(count):
+        known.walk(rates, block_s)
+        moved, J = slope * max(k + 0.5 - from_, 0.0), np.triu(40.0 * rng.normal(size=(p, p)))
+        evidence = Evidence(
+            names=("a", "b", "c"), at=np.zeros(p), J=J, r=rng.normal(size=p) - J @ moved, rest=1.0, n_samples=9,
+            n_outputs=1, first=k, last=k + 1,
+        )  # fmt: skip
+        drift.add(evidence, known)
+        known.absorb(evidence)
+        drift.look(np.vstack([np.eye(p), JOINT]), 1.0)
+        found.append((moved + 0.5 * slope, *drift.begun))
+    drift.restart()
+    assert drift.begun[0].size == 0
+    return found
+
+
+def test_a_drift_that_has_begun_is_seen_with_its_way():
+    for seed in (1, 2, 3):
+        for now, ways, ends in looks(4e-3 * JOINT, seed=seed)[211:216]:
+            together = np.all(ways[:, :2] != 0.0, axis=1)
+            assert together.any()
+            assert np.all(ways[together, 2] == 0.0)
+            assert np.abs(ends[together, 0] - now[0]).min() < 0.35 * now[0]
+
+
+def test_without_a_drift_little_is_suspected():
+    seen = [ways.size > 0 for seed in (1, 2, 3) for _, ways, _ in looks(0.0 * JOINT, seed=seed)]
+    assert np.mean(seen) < 0.06

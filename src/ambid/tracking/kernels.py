@@ -241,6 +241,98 @@ def smooth_ring(J: Array, count: int, first: int, K: Array, sums: Array, N: Arra
 
 Counts = NDArray[np.int64]
 
+
+@compiled(error_model="numpy")
+def _root(A: Array) -> None:
+    """Replace the lower triangle of a positive definite matrix by that of its root, A = L L^T."""
+    for i in range(A.shape[0]):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = math.sqrt(max(total, 1e-14 * A[i, i])) if i == j else total / A[j, j]
+
+
+@compiled(error_model="numpy")
+def _whitened(x: Array, L: Array, B: Array, y: Array) -> None:
+    """Fill `y` with B^-1 L^T x; of L and B only the lower triangles count."""
+    for i in range(x.size):
+        total = 0.0
+        for k in range(i, x.size):
+            total += L[k, i] * x[k]
+        for k in range(i):
+            total -= B[i, k] * y[k]
+        y[i] = total / B[i, i]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def ramps(
+    H: Array, g: Array, q: Array, P: Array, last: int, lengths: Counts, walk: Array, toward: Array, noise: float,
+    T: Array, ways: Array,
+) -> None:  # fmt: skip
+    """Fill `T` (n_lengths, n_causes) with statistics, and `ways` with sizes by now, of ramps along `toward` (n_causes,
+    p) over the last `lengths` chunks of a ring up to `last`: information H (size, p, p) and score g (size, p) at zero,
+    `q` and `P` from before each chunk, variance `walk` (p,) a chunk, the residual's `noise`.
+
+    A ramp w d, w from 0 to 1 over the window, beside numbers known up to P before it, has the score d^T g_w - (H_w d)^T
+    S g, of variance d^T H_ww d - (H_w d)^T S H_w d, S = (P^-1 + H)^-1; g_w, H_w, H_ww are weighted by w and its square.
+    """
+    size, p = g.shape
+    M, m = np.zeros((3, p, p)), np.zeros((2, p))  # moments of the chunks' ages
+    L, B, y, of_d, x = np.empty((p, p)), np.empty((p, p)), np.empty(p), np.empty(p), np.empty(p)
+    window = 0
+    for b in range(lengths[-1]):
+        block, age = (last - b) % size, b + 0.5
+        for i in range(p):
+            m[0, i] += g[block, i] / noise
+            m[1, i] += age * g[block, i] / noise
+            for j in range(p):
+                a = H[block, i, j] / noise
+                M[0, i, j] += a
+                M[1, i, j] += age * a
+                M[2, i, j] += age * age * a
+        if b + 1 < lengths[window]:
+            continue
+        n = float(lengths[window])
+        for i in range(p):
+            x[i] = m[0, i]
+            for j in range(p):
+                x[i] += M[0, i, j] * q[block, j]
+                L[i, j] = P[block, i, j] + (n * walk[i] if i == j else 0.0)
+        _root(L)
+        for i in range(p):
+            for k in range(p):  # of_d: column i of H L
+                of_d[k] = 0.0
+                for j in range(i, p):
+                    of_d[k] += M[0, k, j] * L[j, i]
+            for k in range(i, p):
+                B[k, i] = 1.0 if i == k else 0.0
+                for j in range(k, p):
+                    B[k, i] += L[j, k] * of_d[j]
+        _root(B)
+        _whitened(x, L, B, y)
+        for c in range(toward.shape[0]):
+            way = power = 0.0
+            for i in range(p):
+                x[i] = 0.0
+            for j in range(p):
+                d = toward[c, j]
+                if d != 0.0:
+                    way += d * (m[0, j] - m[1, j] / n)
+                    for i in range(p):
+                        one = (M[0, i, j] - M[1, i, j] / n) * d
+                        x[i] += one
+                        way += one * q[block, i]
+                        power += toward[c, i] * (one + (M[2, i, j] / n - M[1, i, j]) / n * d)
+            _whitened(x, L, B, of_d)
+            for i in range(p):
+                way -= of_d[i] * y[i]
+                power -= of_d[i] * of_d[i]
+            power = max(power, 1e-30)
+            T[window, c], ways[window, c] = way * way / power, -way / power
+        window += 1
+
+
 _QUANTILE = 0.03  # share of quiet statistics above the point by which overdispersion is learned
 _LARGEST_GAIN = 0.02  # of learning overdispersion
 _SETTLE_GAIN = 12.0  # over the number of tests, while settling: one over the density of log chi-squared at that point

@@ -23,7 +23,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.recursive.estimator import covariance_of, factors_of
 from ambid.recursive.square_root_kernels import deviations, walk, widen
 from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
-from ambid.tracking.kernels import absorb, filter_ring, smooth_ring
+from ambid.tracking.kernels import absorb, filter_ring, ramps, smooth_ring
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
 
 Flags = NDArray[np.bool_]
@@ -110,12 +110,17 @@ _SLOWER, _FASTER = 0.5, 10.0  # factors by which one adaptation may change a var
 _ROUNDS = 10  # of raising a variance at one look
 _WITHIN = 6.0  # what may walk within a chunk, as squares of its innovations: more would be taken for other numbers
 _NOTICED = 3.0  # factor of a variance from which the recent past is filtered anew
+_RAMPS = np.array([5, 7, 10, 14, 20])  # chunks since which something may drift steadily
+# statistics from which it may be so: chance passes each as often, in 3e-4 of the cases for each chunk of the window
+_BEGUN = np.array([10.1, 9.5, 8.8, 8.2, 7.6])
+_ALIKE = 9.2  # by which statistics of drifts differ by chance in one of a hundred cases
 
 
 class DriftRates:
     """Variances per second of the walks, from `start` (p,) within `floor` and `ceiling` (p,): equal ones are not
     adapted. `block_s`: length of the evidence to come, s; `adapts`: whether they are found from the data; `walks`:
-    whether any variance is, or may become, positive; `suspected` (p,): which seem to have begun to walk, to be set.
+    whether any variance is, or may become, positive; `suspected` (p,): which seem to have begun to walk, to be set;
+    `begun`: how far steady drifts that may have begun take the numbers until the next look, and where to, both (n, p).
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
@@ -128,6 +133,8 @@ class DriftRates:
         room = _WINDOW if self.adapts else 0
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
+        self._H, self._g = np.zeros((room, p, p)), np.zeros((room, p))
+        self.begun = self._none = np.zeros((0, p)), np.zeros((0, p))
         self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
         self._chunk = EvidenceSum(p)
         self._count = self._next = self._since = self._looks = 0
@@ -144,7 +151,9 @@ class DriftRates:
         chunk.add(evidence)
         if chunk.blocks < self._per_chunk:
             return
-        self._J[self._next], self._r[self._next], self._at[self._next] = chunk.T[:, :-1], chunk.T[:, -1], chunk.at
+        J, r = chunk.T[:, :-1], chunk.T[:, -1]
+        self._J[self._next], self._r[self._next], self._at[self._next] = J, r, chunk.at
+        self._H[self._next], self._g[self._next] = J.T @ J, J.T @ (r - J @ chunk.at)
         chunk.blocks = 0
         self._next = (self._next + 1) % _WINDOW
         self._count = min(self._count + 1, _WINDOW)
@@ -184,6 +193,28 @@ class DriftRates:
             if np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0):
                 present.set(np.where(active, q, present.q), P)
 
+    def look(self, toward: Array, noise: float) -> None:
+        """Look, where a chunk is complete, for ramps of the causes `toward` (n_causes, p) in windows up to now: those
+        that chance does not make, and that explain the data about as well as the likeliest, have `begun`; `noise`: the
+        residual's variance.
+        """
+        if not self.adapts or self._chunk.blocks:
+            return
+        self.begun = self._none
+        windows = int(np.searchsorted(_RAMPS, self._count, side="right"))
+        if not windows:
+            return
+        T, sizes = np.empty((2, windows, len(toward)))
+        walk, last = 0.5 * self._chunk_s * self.variance, self._next - 1
+        ramps(self._H, self._g, self._q, self._P, last, _RAMPS[:windows], walk, toward, noise, T, sizes)
+        least = np.maximum(_BEGUN[:windows, None], T.max() - _ALIKE)
+        likely = least < T
+        if likely.any():
+            window, cause = np.nonzero(likely)
+            n = _RAMPS[window]
+            ways = (sizes[window, cause] * (n + 1) / n)[:, None] * toward[cause]
+            self.begun = ways, self._q[self._next - n] + ways
+
     @property
     def risen(self) -> Array:
         """By how much numbers walk faster than was thought at the start."""
@@ -193,6 +224,7 @@ class DriftRates:
         """Forget the window: a jump in it would pass for drift."""
         self._count = self._next = self._since = self._chunk.blocks = 0
         self.suspected[:] = False
+        self.begun = self._none
 
     def _raise(self, ratio: Array) -> None:
         factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
@@ -257,6 +289,8 @@ class PhysicalRpem:
         self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
         self._joints = [numbers.direction(cause) for cause in numbers.joints]
+        free = (numbers.names[j] for j in numbers.places("parameter", "gain", "offset", "unbalance"))
+        self._causes = np.array([*(numbers.direction(name) for name in free), *self._joints])
         self._part = -float(np.expm1(-self.block_s / _NOISE_S))
 
     @property
@@ -322,6 +356,7 @@ class PhysicalRpem:
         self.drift.add(evidence, self.filter)
         self.filter.absorb(evidence, self.noise_of(evidence))
         self.drift.adapt(self.filter, self.noise)
+        self.drift.look(self._causes, self.noise)
         self.follow_noise(evidence)
         self.refresh()
 

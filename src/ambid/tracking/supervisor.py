@@ -7,6 +7,7 @@ operator's flags stand above all, and every decision is an event with its reason
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -59,7 +60,8 @@ class Supervisor:
         self._silent, self._heard, self._deaf_s = False, 0, 0.0  # no evidence since when: sample, and s
         self._spoken = False  # whether there has been any
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
-        self._shown: tuple[Accepted, dict[str, bool], bool] | None = None  # what the parameters were made of
+        # what the parameters were made of
+        self._shown: tuple[Accepted, dict[str, bool], bool, tuple[Array, Array]] | None = None
         self._parameters: dict[str, TrackedValue] = {}
 
     @property
@@ -75,9 +77,12 @@ class Supervisor:
     @property
     def parameters(self) -> dict[str, TrackedValue]:
         """Published physical parameters, SI; stale where they are not informed, or known to be no longer right."""
-        source = (self.publication.accepted, self._fresh, self._trusted())
+        source = (self.publication.accepted, self._fresh, self._trusted(), self.rpem.drift.begun)
         if self._shown is None or any(a is not b for a, b in zip(self._shown, source, strict=True)):
-            accepted, fresh, trusted = self._shown = source
+            accepted, fresh, trusted, (ways, ends) = self._shown = source
+            # the part of a drift that is not followed yet, as if it were chance
+            left = np.minimum(np.abs(ends - accepted.values), np.abs(ways)).max(axis=0, initial=0.0)
+            accepted = replace(accepted, covariance=accepted.covariance + np.diag(left**2))
             now = {name: one and trusted for name, one in fresh.items()}
             self._parameters = published(self.rpem.numbers, accepted, "parameter", now)
         return dict(self._parameters)
