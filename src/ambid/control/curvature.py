@@ -21,12 +21,16 @@ from ambid.control.information import Information
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, products, run, weight_of, workspace_near
 from ambid.estimation.predictor import assemble
+from ambid.estimation.result import NORMAL_95
 from ambid.physics.linear_model import discretise
 from ambid.rig import Rig
 from ambid.settings.caller import setting
 
 MOST = 1.5
-"""Standard deviations by which curvature may move a number: its 95 % interval then holds it in two of three records."""
+"""Standard deviations by which curvature may move a number: its 95 % interval then holds it in two of three records.
+Beyond, what it has done becomes part of the interval."""
+_HELD = 3.0  # sd up to which that interval is good enough (beyond, what is of higher degree moves a number too), …
+_WIDE = 0.01  # … if with it half of the interval is no more than this part of the number
 _TOLD = 0.25  # sd of the part of the curvature that a record shows, up to which the record is believed and not the law
 _UNTOLD = 0.5  # sd from which it does not tell whether the law is there at all
 _STEP = 1e-30  # of complex differences, which lose no digits
@@ -88,8 +92,8 @@ def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
 
 
 def magnet_checks(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Array) -> dict[str, Check]:
-    """Check that curvature moves no number by more than its `sd` (n_physical,), SI, allows, as far as a law is known,
-    and that what the rig gives of it is that of the estimate.
+    """Check that curvature moves no number by more than its `sd` (n_physical,), SI, or the interval that holds it,
+    allows, as far as a law is known, and that what the rig gives of it is that of the estimate.
     `e`: see `seen_shift`. A rig's law counts unless the record contradicts it; with an assumed gap only as far as the
     record shows it, and what that shows beyond the law is of second order in the shift, and no larger one.
     """
@@ -126,11 +130,16 @@ def advised(shift: Mapping[str, float]) -> float:
 
 
 def judge_shift(shift: Mapping[str, float], size: Mapping[str, float], theta: Mapping[str, float]) -> tuple[bool, str]:
-    """Return whether shifts in sd are small, and what is said of them; `size`: SI."""
+    """Return whether shifts in sd are small, or what intervals that hold them can bear, and what is said of them;
+    `size`: SI.
+    """
     worst = sorted(shift, key=lambda name: -abs(shift[name]))
     far = [name for name in worst if abs(shift[name]) > MOST]
     if not far:
         most = f"{worst[0]} by {shift[worst[0]]:+.2f} sd"
         return True, f"over this motion the magnet's curvature moves no number far ({most} at most)"
+    half = {n: NORMAL_95 * abs(size[n]) * np.hypot(1.0, 1.0 / shift[n]) for n in far}
+    borne = all(abs(shift[n]) <= _HELD and half[n] <= _WIDE * abs(theta[n]) for n in far)
     listed = ", ".join(f"{n} by {shift[n]:+.1f} sd ({100.0 * size[n] / abs(theta[n]):+.2g} %)" for n in far)
-    return False, f"over this motion the magnet's curvature moves {listed} from the value at the operating point"
+    text = f"over this motion the magnet's curvature moves {listed} from the value at the operating point"
+    return borne, f"{text}; the intervals hold it" if borne else text

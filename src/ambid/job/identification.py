@@ -257,16 +257,17 @@ def _judged(
         from ambid.validation.causes import causes, causes_check, named_bias
 
         in_time = check_lag(signals)
-        curved, own = None, np.sqrt(np.diag(spread.information))
+        curved, bent, own = None, False, np.sqrt(np.diag(spread.information))
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
-            from ambid.control.curvature import magnet_checks
+            from ambid.control.curvature import MOST, magnet_checks
 
             sd = spread.standard_deviations(robust=robust)
             checks |= magnet_checks(fit, e, rig, means, sd)
             curved = checks.get("curvature")
-        bent = curved is not None and not curved.passed  # a law says more than powers of the motion
-        if curved is not None and bent:
-            spread = replace(spread, bias=np.array([curved.values[name] for name in spread.names]) * sd)
+        if curved is not None:
+            shift = np.array([curved.values[name] for name in spread.names])
+            bent = bool(np.any(np.abs(shift) > MOST))  # a law says more than powers of the motion
+            spread = replace(spread, bias=shift * sd) if bent else spread
         before, given = dict(checks), delay_how == "given"
         for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
             named = [
