@@ -15,19 +15,19 @@ from ambid.errors import AmbidError, counted, nearest
 if TYPE_CHECKING:
     from ambid.rig.roles import Candidate
 
-_WIRED = ("prototype",)  # presets with a controller, whose rig is among the package's data
-
 
 @verb("init")
 def command(v: Values) -> None:
     """Write a commented rig file, guessed from a record's columns or of a preset bench, to be checked and edited."""
+    from ambid.rig.draft import WIRED
+
     if (v.record is None) == (v.preset is None):
         given = (
             "both a record and --preset were given"
             if v.record is not None
             else "neither a record nor --preset was given"
         )
-        raise AmbidError(f"{given}; a rig file comes from exactly one. Give RECORD, or --preset {_WIRED[0]}")
+        raise AmbidError(f"{given}; a rig file comes from exactly one. Give RECORD, or --preset {WIRED[0]}")
     if v.preset is not None and (v.rate_hz is not None or v.gaps is not None or v.layout):
         raise AmbidError("--rate, --gaps and --layout are for reading a record; --preset reads none. Omit them")
     if v.preset is not None and v.plot is not None:
@@ -39,7 +39,7 @@ def command(v: Values) -> None:
             outputs.stage_text(v.out, text)
     if v.out is None:
         typer.echo(text, nl=False)
-    elif v.preset in _WIRED:
+    elif v.preset in WIRED:
         typer.echo(
             f"{v.out} written; edit what differs on your bench. Then: ambid commission --rig {v.out} --port PORT"
         )
@@ -97,16 +97,12 @@ def _chosen(role: str, found: Sequence[Candidate]) -> Sequence[Candidate]:
 
 
 def _of_preset(name: str) -> str:
-    from importlib.resources import files
-
     from ambid.physics.presets import preset, preset_names
-    from ambid.rig import preset_text
+    from ambid.rig.draft import WIRED, preset_text, wired_text
 
     if name not in preset_names():
         raise AmbidError(
             f"--preset {name!r} is unknown; known: {', '.join(preset_names())}.{nearest(name, preset_names())} "
             "Give one of them, or RECORD"
         )
-    if name not in _WIRED:
-        return preset_text(preset(name))
-    return files("ambid").joinpath("data", f"{name}.toml").read_text(encoding="utf-8")
+    return wired_text(name) if name in WIRED else preset_text(preset(name))

@@ -74,6 +74,7 @@ def _run_scenario(v: Values, preset: Preset | None) -> None:
     """
     from ambid.record import write_record
     from ambid.rig import load_rig
+    from ambid.rig.draft import as_logged
     from ambid.simulation import simulate_scenario
     from ambid.simulation.scenarios import damage, scenario
 
@@ -83,7 +84,7 @@ def _run_scenario(v: Values, preset: Preset | None) -> None:
     how |= {"duration_s": v.duration, "at_s": at_s, "size": size_asked}
     with Outputs(None if preset else Path(v.rig)) as outputs, progress("simulate"):
         outputs.claim(record, "out", _ENDINGS[:2] if what.dropped else _ENDINGS, force=v.force)
-        done = simulate_scenario(what, preset or load_rig(Path(v.rig)), seed=v.seed, **how)
+        done = simulate_scenario(what, as_logged(preset) if preset else load_rig(Path(v.rig)), seed=v.seed, **how)
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
         lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")
         size = f" of {told['size']:.6g} ({told['size_is']})" if "size" in told else ""

@@ -20,6 +20,7 @@ from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset_of
 from ambid.record import Channel, Record
 from ambid.rig import Rig, RigMagnet, load_rig, rig_of_preset
+from ambid.rig.draft import as_logged
 from ambid.settings.caller import (
     check_band,
     check_number,
@@ -110,7 +111,7 @@ def simulate(
     Returns
     -------
     Record
-        Columns are named as in the rig; those of a preset by role.
+        Columns are named as in the rig; those of a preset as in the rig file that ``ambid init`` writes of it.
 
     Raises
     ------
@@ -282,8 +283,8 @@ def _bench(
 ) -> Bench | RotorBench:
     """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
     source = bench_of_source(given)
-    if isinstance(source, Preset) and source.rotor is not None:
-        source = rig_of_preset(source)
+    if isinstance(source, Preset):
+        source = rig_of_preset(source) if source.rotor is not None else as_logged(source)
     if isinstance(source, Preset):
         if position is not None and source.plant is not None:
             source = replace(source, operating_point=source.plant.equilibrium(position))

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 from ambid.physics.coenergy_law import law_numbers
@@ -15,6 +16,7 @@ from ambid.physics.magnet import CoEnergy
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record
+from ambid.rig.load import rig_from_text
 from ambid.rig.rig import (
     OPTIONAL_ROLES,
     RecordSettings,
@@ -30,6 +32,9 @@ from ambid.rig.roles import NAMES, SET_POINT, Candidate, at_rest, rank_roles
 from ambid.rig.rotor import RigModes
 from ambid.settings.caller import command, setting
 from ambid.units import UNKNOWN, parse_unit
+
+WIRED = ("prototype",)
+"""Presets with a controller of their own, whose rig, in which columns are its counts, is among the package's data."""
 
 
 def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None = None) -> str:
@@ -254,6 +259,18 @@ def rig_of_preset(bench: Preset) -> Rig:
             parameters=tuple(Parameter(name=n, unit=specs[n].unit, value=x, role="fixed") for n, x in numbers.items()),
         ),
     )  # fmt: skip
+
+
+def wired_text(name: str) -> str:
+    """Return the rig file of one of `WIRED`, in which the controller has its settings, and little is known."""
+    return files("ambid").joinpath("data", f"{name}.toml").read_text(encoding="utf-8")
+
+
+def as_logged(bench: Preset) -> Preset | Rig:
+    """Return a bench that logs as its controller does: one of `WIRED` as a rig that simulates it in counts."""
+    if bench.name not in WIRED:
+        return bench
+    return replace(rig_of_preset(bench), channels=rig_from_text(wired_text(bench.name), f"{bench.name}.toml").channels)
 
 
 def preset_text(bench: Preset) -> str:
