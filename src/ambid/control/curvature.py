@@ -16,7 +16,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.drawn import Law, laws_of, magnet_check
-from ambid.control.experiment import Lines, Task
+from ambid.control.experiment import MOST, Lines, Task
 from ambid.control.information import Information
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, products, run, weight_of, workspace_near
@@ -26,11 +26,9 @@ from ambid.physics.linear_model import discretise
 from ambid.rig import Rig
 from ambid.settings.caller import setting
 
-MOST = 1.5
-"""Standard deviations by which curvature may move a number: its 95 % interval then holds it in two of three records.
-Beyond, what it has done becomes part of the interval."""
-_HELD = 3.0  # sd up to which that interval is good enough (beyond, what is of higher degree moves a number too), …
-_WIDE = 0.01  # … if with it half of the interval is no more than this part of the number
+# An interval that holds the shift is good enough up to so many sd of it (beyond, what is of higher degree moves numbers
+# too), as long as half of it is no more than this part of the number.
+_HELD, _WIDE = 3.0, 0.01
 _TOLD = 0.25  # sd of the part of the curvature that a record shows, up to which the record is believed and not the law
 _UNTOLD = 0.5  # sd from which it does not tell whether the law is there at all
 _STEP = 1e-30  # of complex differences, which lose no digits
@@ -110,7 +108,7 @@ def magnet_checks(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Arr
         counted = float(laws[""].known and (part > 0.5 or part_sd > _UNTOLD))
     names = fit.problem.estimated
     values = dict(zip(names, (counted * shift / sd).tolist(), strict=True))
-    passed, text = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta)
+    passed, text = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta, held=True)
     if not passed:
         text += f" ({assumed[0]}; the record shows {part:.2g} ± {part_sd:.2g} of it)"
         text += (
@@ -129,9 +127,11 @@ def advised(shift: Mapping[str, float]) -> float:
     return float((MOST / max(map(abs, shift.values()))) ** (1.0 / 3.0))
 
 
-def judge_shift(shift: Mapping[str, float], size: Mapping[str, float], theta: Mapping[str, float]) -> tuple[bool, str]:
-    """Return whether shifts in sd are small, or what intervals that hold them can bear, and what is said of them;
-    `size`: SI.
+def judge_shift(
+    shift: Mapping[str, float], size: Mapping[str, float], theta: Mapping[str, float], *, held: bool
+) -> tuple[bool, str]:
+    """Return whether shifts in sd are small, or `held` by intervals that can bear them, and what is said of them;
+    `size`: SI. A design, whose excitation can still be smaller, has no such intervals.
     """
     worst = sorted(shift, key=lambda name: -abs(shift[name]))
     far = [name for name in worst if abs(shift[name]) > MOST]
@@ -139,7 +139,7 @@ def judge_shift(shift: Mapping[str, float], size: Mapping[str, float], theta: Ma
         most = f"{worst[0]} by {shift[worst[0]]:+.2f} sd"
         return True, f"over this motion the magnet's curvature moves no number far ({most} at most)"
     half = {n: NORMAL_95 * abs(size[n]) * np.hypot(1.0, 1.0 / shift[n]) for n in far}
-    borne = all(abs(shift[n]) <= _HELD and half[n] <= _WIDE * abs(theta[n]) for n in far)
+    borne = held and all(abs(shift[n]) <= _HELD and half[n] <= _WIDE * abs(theta[n]) for n in far)
     listed = ", ".join(f"{n} by {shift[n]:+.1f} sd ({100.0 * size[n] / abs(theta[n]):+.2g} %)" for n in far)
     text = f"over this motion the magnet's curvature moves {listed} from the value at the operating point"
     return borne, f"{text}; the intervals hold it" if borne else text

@@ -259,7 +259,8 @@ def _judged(
         in_time = check_lag(signals)
         curved, bent, own = None, False, np.sqrt(np.diag(spread.information))
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
-            from ambid.control.curvature import MOST, magnet_checks
+            from ambid.control.curvature import magnet_checks
+            from ambid.control.experiment import MOST
 
             sd = spread.standard_deviations(robust=robust)
             checks |= magnet_checks(fit, e, rig, means, sd)
