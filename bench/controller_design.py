@@ -21,6 +21,7 @@ from ambid.control.closed import Plant
 from ambid.control.design import GOALS, Figures, Goals, noise_of, verify, worst_of
 from ambid.control.drawn import Drawn, draw_plants, over_speeds
 from ambid.control.tuning import tune_pid
+from ambid.control.zones import zone_of
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent
 from ambid.job.closed_loop import Numbers, plant_of
@@ -30,7 +31,6 @@ from ambid.physics.presets import preset
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, rig_of_preset
 from ambid.rig.rig import RigModes
-from ambid.simulation.margins import zone_of
 from ambid.simulation.rotor_bench import RotorBench
 from table import Table
 

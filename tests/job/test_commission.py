@@ -12,6 +12,7 @@ import pytest
 from ambid.acquisition.device import SelfTest
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.devices.simulated import SimulatedDevice
+from ambid.control.zones import Zone
 from ambid.errors import AmbidError, EstimationError, ModelError
 from ambid.estimation.result import Reason, Verdict
 from ambid.job import commissioning as room
@@ -102,6 +103,72 @@ def test_what_it_says_has_digits_and_units_for_people(finished):
         assert 0.7 < float(told[1]) / float(told[2]) < 1.5  # a record of 4 s, designed on a trial of two
 
 
+def test_a_loop_is_judged_at_the_position_and_named_nowhere_else(finished):
+    """Opened at the controller's output its sensitivity is 1.2 dB, at the position 9.5 dB, where zone A ends."""
+    _, done, _, _ = finished
+    step = next(s for s in done.steps if s.name == "identify")
+    zone = Zone.read(done.estimate.sensitivity["x"])
+    assert step.numbers["sensitivity_upper_db"] == zone.upper_db > 9.3
+    for line in (*step.findings, *step.cautions):
+        assert ("ISO 14839-3" in line) == ("sensitivity of the loop" in line or "at the position" in line)
+    warned = [c for c in step.cautions if "sensitivity" in c]
+    assert bool(warned) == (zone.worst == "B")
+    assert all(word in warned[0] for word in (zone.source, zone.words, "redesign", "estimate.json"))
+
+
+@pytest.mark.parametrize("of", [SimulatedDevice, EmulatedDevice])
+def test_a_loop_with_too_little_margin_is_not_to_be_used(tmp_path, of, request):
+    if of is EmulatedDevice:
+        request.getfixturevalue("bench_program"), request.getfixturevalue("firmware_elf")
+    rig = prototype(("kp = 19415.0", "kp = 15532.0"))
+    done = ran(tmp_path, of(rig), rig=rig)
+    stopped_at("identify", done, "at the position", "zone D", "ISO 14839-3", "the rotor is set down")
+    assert done.verdict.word == "unusable"
+    assert Zone.read(done.estimate.sensitivity["x"]).worst == "D"
+    assert "better loop" in done.steps[-1].remedy
+
+
+def judged(peak, sd, measured=None, **plan):
+    """The step `identify` of an estimate that is sound but for its loop."""
+    s = {"peak_db": {"value": peak, "sd": sd}, "frequency_hz": 16.0, "measured_peak_db": None}
+    if measured is not None:
+        s |= {"measured_peak_db": measured[0], "measured_sd_db": measured[1], "measured_frequency_hz": 16.0}
+    estimate = SimpleNamespace(status="converged", parameters=(), checks={}, sensitivity={"x": s}, warnings=())
+    return judge.identification(estimate, replace(SHORT, **plan), {})
+
+
+@pytest.mark.parametrize(
+    ("peak", "measured", "passed", "words"),
+    [
+        ((5.0, 0.1), None, True, None),
+        ((5.0, 0.1), (9.4, 0.2), True, "zone A or B"),
+        ((5.0, 0.1), (11.0, 0.2), True, "zone B"),
+        ((5.0, 0.1), (11.8, 0.2), False, "is not ruled out. Record longer"),
+        ((5.0, 0.1), (13.0, 0.2), False, "zone C"),
+        ((15.0, 0.1), None, False, "predicted 15.00 ± 0.10 dB"),
+        ((15.0, 0.1), (8.0, 0.1), False, "predicted 15.00 ± 0.10 dB"),
+    ],
+)
+def test_the_upper_end_of_the_interval_decides(peak, measured, passed, words):
+    step = judged(*peak, measured)
+    assert step.passed == passed
+    lines = (*step.cautions, *step.reasons)
+    assert lines == () if words is None else words in lines[0]
+
+
+def test_a_better_loop_is_not_offered_where_it_is_on_its_way():
+    assert "redesign" in judged(11.0, 0.1).cautions[0]
+    assert "redesign" not in judged(11.0, 0.1, redesign=True).cautions[0]
+
+
+def test_a_loop_that_cannot_be_judged_is_not_passed():
+    said = "no sensitivity: the rig's [loop] does not hold the estimated plant"
+    estimate = SimpleNamespace(status="converged", parameters=(), checks={}, sensitivity={}, warnings=(said,))
+    step = judge.identification(estimate, SHORT, {})
+    assert not step.passed
+    assert said in step.reasons[0]
+
+
 def test_what_cannot_be_designed_is_found_by_trials(tmp_path, monkeypatch):
     def nothing(*_args, **_options):
         raise EstimationError("the rig has no limits")
@@ -184,7 +251,7 @@ def test_the_report_shows_what_each_step_saw(finished):
     assert seen == dict.fromkeys(STEPS, 1) | {"self-test": 0, "excite": 2, "record": 2, "validate": 0, "track": 0}
     assert text.count("<svg ") > sum(seen.values()) + 4  # those of the estimate and the track too
     assert text.index("verdict: <") < text.index("1. self-test")
-    assert "sensitivity peak" in text
+    assert "peak of the sensitivity at the controller" in text
     assert done.verdict.word == json.loads((folder / "commission.json").read_text())["verdict"]["word"]
 
 

@@ -52,6 +52,20 @@ def test_nothing_that_was_not_seen_comes_out_as_a_number_anywhere(history):
     assert [int(np.isnan(y).sum()) for y in drawn] == [3, 1]
 
 
+@pytest.mark.parametrize(
+    ("measured", "zone"), [((9.496, 0.08), "zone A or B"), (None, "zone A (98 %)"), ((8.0, 0.1), "zone A (98 %)")]
+)
+def test_the_zone_of_a_loop_is_that_of_its_latest_peak(tmp_path, measured, zone):
+    """Measured where it was measured; a predicted peak that is surely higher counts instead."""
+    numbers = [parameter("x.sensitivity", 9.466, 0.037, unit="dB")]
+    if measured is not None:
+        numbers.append(parameter("x.sensitivity_measured", *measured, unit="dB"))
+    with open_ledger(tmp_path / "l.db") as ledger:
+        ledger.add([entry(0, day=0, parameters=tuple(numbers))])
+    shown = presentation.text(ambid.history("A", ledger=tmp_path / "l.db"), width=120)
+    assert f"9.466 ± 0.037 dB, {zone}" in shown
+
+
 def test_events_and_changes_of_the_rig_stand_in_order_of_time(history):
     assert [(e.kind, e.text) for e in history.events] == [
         ("change", "it fell"), ("rig", 'name = "one" became name = "two"'),

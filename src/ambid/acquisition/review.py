@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -167,12 +168,18 @@ def predicted(
         raise RigError(f"{who(rig)}: on {whose} {failure}") from None
 
 
-def loop_on(rig: Rig, info: DeviceInfo, parameters: Mapping[str, float] = _NOBODY) -> tuple[LoopMargins | None, str]:
-    """Predict, as `predicted`, the loop that a device closes on a plant of all these parameters (SI) or the rig's."""
+def loop_on(
+    rig: Rig, info: DeviceInfo, parameters: Mapping[str, float] = _NOBODY, *, delay: float | None = None
+) -> tuple[LoopMargins | None, str]:
+    """Predict, as `predicted`, the loop that a device closes on a plant of all these parameters (SI) or the rig's;
+    `delay`: as identified, samples.
+    """
     full = with_default_daq(rig) if info.kind in ("emulated", "simulated") else rig
     settings = controller_settings(full)
     if parameters:
-        return loop_margins(parameters, realised(settings, full), settings.rate_hz, of=rig.model), ""
+        loop = realised(settings, full)
+        loop = loop if delay is None else replace(loop, delay=delay)
+        return loop_margins(parameters, loop, settings.rate_hz, of=rig.model), ""
     return predicted(full, settings, info.plant)
 
 

@@ -32,6 +32,7 @@ from ambid.control.margins import (
     sensitivity_by_axis,
 )
 from ambid.control.verification import Verification
+from ambid.control.zones import ZONES, zone_of
 from ambid.errors import EstimationError, ModelError, nearest
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.progress import Tick, silent
@@ -40,7 +41,6 @@ from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, rig_from_text
-from ambid.simulation.margins import ZONES, zone_of
 from ambid.simulation.plant import closed_loop_matrix, fed_back, signals_fed_back
 
 SCHEMA = "ambid.design/1"

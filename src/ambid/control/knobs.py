@@ -23,12 +23,12 @@ from ambid.control.closed import Plant
 from ambid.control.design import Goals, closed_loop_of, examine, mean_over, noise_of, worst_of
 from ambid.control.lqg import SampledPlant, Weights, hinf, lqg, reduced
 from ambid.control.tuning import raised, said
+from ambid.control.zones import ZONES
 from ambid.errors import EstimationError, ModelError, RigError
 from ambid.estimation.progress import Tick
 from ambid.physics.law import StateLaw, l1_norms
 from ambid.physics.loop import Loop, Noise
 from ambid.rig import Rig
-from ambid.simulation.margins import ZONES
 from ambid.simulation.plant import signals_fed_back
 
 _FREQUENCIES = 150

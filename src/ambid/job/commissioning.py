@@ -28,7 +28,7 @@ from ambid.job.commissioning_steps import STEPS, Plan, StepName
 from ambid.job.controller_design import design_controller
 from ambid.job.experiment_design import HIGHEST, design_experiment
 from ambid.job.identification import identify_axis
-from ambid.job.loop_margins import margins
+from ambid.job.loop_margins import margins, margins_beside
 from ambid.job.presentation import page
 from ambid.job.track_live import track_live
 from ambid.physics.linear_model import model
@@ -403,9 +403,12 @@ class _Guide:
             self._place / "record.h5", self._rig, validate=self._place / "second.h5", tick=self._tick
         )
         write_text(self._place / "estimate.json", self.estimate.dumps())
-        found = loop_on(self._rig, self._device.info, self.estimate.values)[0]
+        late = next(iter(self.estimate.delay.values()))
+        delay = late.samples + late.fraction
+        found = loop_on(self._rig, self._device.info, self.estimate.values, delay=delay)[0]
         loops = {"identified": found} if found is not None else {}
-        return judge.identification(self.estimate, self.plan, {**loops, **self._loops}, self._experiment)
+        beside = margins_beside(self.estimate, self.estimate.used)
+        return judge.identification(self.estimate, self.plan, {**loops, **self._loops}, self._experiment, beside)
 
     def _redesign(self) -> Step:
         """Design a better loop on what was identified; where none is found the present one stays."""

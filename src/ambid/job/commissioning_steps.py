@@ -32,6 +32,7 @@ from ambid.arrays import Array
 from ambid.control.design import FIGURES, Design
 from ambid.control.experiment import Experiment
 from ambid.control.margins import Margins
+from ambid.control.zones import LONG_TERM, Zone
 from ambid.estimation.estimate import Estimate
 from ambid.job.track_live import LiveTrack
 from ambid.report.commission import (
@@ -50,6 +51,7 @@ from ambid.report.device import acquired_sections
 from ambid.report.document import sections_text
 from ambid.report.estimate import sensitivity_lines
 from ambid.report.numbers import quantity, sized
+from ambid.report.text import pure
 from ambid.rig import Rig
 from ambid.settings.caller import setting
 from ambid.simulation.margins import LoopMargins
@@ -382,16 +384,22 @@ def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Ste
 
 
 def identification(
-    estimate: Estimate, plan: Plan, loops: Mapping[str, LoopMargins], experiment: Experiment | None = None
+    estimate: Estimate,
+    plan: Plan,
+    loops: Mapping[str, LoopMargins],
+    experiment: Experiment | None = None,
+    margins: Margins | None = None,
 ) -> Step:
-    """Judge an estimate: found at all, parameters identifiable and known as well as `plan` says, nothing implausible.
-    `loops`: controller's margins by name, first on the identified plant, then the expected; `experiment`: played, with
-    its promise. Failed residual tests are cautions, as standard deviations allow for them.
+    """Judge an estimate: found at all, parameters identifiable and known as well as `plan` says, nothing implausible;
+    and the loop by its zone. `loops`: controller's margins by name, first on the identified plant, then the expected;
+    `experiment`: played, with its promise; `margins`: of the record, drawn. Failed residual tests are cautions, as
+    standard deviations allow for them.
     """
     findings: list[str] = []
     reasons: list[str] = []
     cautions: list[str] = []
     numbers: dict[str, float] = {}
+    remedy = ""
     if estimate.status != "converged":
         reasons.append(f"the search ended {estimate.status}: check columns, signs and calibrations")
     for p in estimate.parameters:
@@ -415,12 +423,40 @@ def identification(
         if not check.passed:
             (cautions if name in _RESIDUAL else reasons).append(f"{name}: {check.detail}")
     for loop in list(loops.values())[:1]:
-        (findings if loop.stable and loop.zone != "D" else cautions).append(f"the loop on this plant: {loop.words()}")
+        (findings if loop.stable else cautions).append(f"the loop on this plant: {loop.words()}")
     findings += sensitivity_lines(estimate.sensitivity)
+    if not estimate.sensitivity:
+        why = "; ".join(w for w in estimate.warnings if "sensitivity" in w) or "[loop] and the estimate do not agree"
+        reasons.append(f"the sensitivity at the position is not known, and the loop cannot be judged: {why}")
+    for zone in map(Zone.read, estimate.sensitivity.values()):
+        numbers |= {"sensitivity_db": zone.peak_db, "sensitivity_upper_db": zone.upper_db}
+        refused, warned = _by_zone(zone, "" if plan.redesign else _offer())
+        remedy = "design a better loop, and load that" if refused and not reasons else ""
+        reasons, cautions = [*reasons, *refused], [*cautions, *warned]
     return Step(
         name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
-        pictures=(margins_picture(loops),) if loops else (),
+        pictures=(margins_picture(loops, margins),) if loops else (), remedy=remedy,
     )  # fmt: skip
+
+
+def _offer() -> str:
+    return f". Commission again with {setting('redesign')}, or design a better loop on estimate.json"
+
+
+def _by_zone(zone: Zone, offer: str) -> tuple[list[str], list[str]]:
+    """Return what a loop is refused and warned for by the upper end of its peak's 95 % interval; `offer`: the remedy of
+    a warning.
+    """
+    size = f"{pure(zone.peak_db, zone.sd_db)} dB, at most {zone.upper_db:.2f} dB (95 %)"
+    text = f"the sensitivity at the position, {zone.source} {size}, is in zone {zone.words} of ISO 14839-3"
+    if zone.worst in LONG_TERM:
+        return [], [] if zone.worst == "A" else [f"{text}: new machines are to be in zone A{offer}"]
+    why = "too little margin to run with this loop. Design"
+    if zone.letters[0] in LONG_TERM:
+        why = (
+            f"too little margin to run with this loop is not ruled out. Record longer ({setting('seconds')}), or design"
+        )
+    return [f"{text}: {why} a better one on estimate.json; the rotor is set down"], []
 
 
 def redesign(design: Design, estimate: Estimate) -> Step:
@@ -449,8 +485,8 @@ def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]
     findings, numbers = list(kept.findings), dict[str, float]()
     for (name, of), when in zip(loops.items(), ("before", "after"), strict=True):
         s = of.sensitivity["x"]
-        seen = "" if s.measured_peak_db is None else f", measured {s.measured_peak_db:.2f} dB"
-        findings.append(f"{name}: peak of the sensitivity {s.peak_db.value:.2f} dB{seen}, zone {s.zone}")
+        seen = "" if s.measured is None else f", measured {pure(*s.measured)} dB"
+        findings.append(f"{name}: peak of the sensitivity {s.peak_db.value:.2f} dB{seen}, zone {s.judged.words}")
         numbers |= {f"peak_{when}_db": s.peak_db.value}
         numbers |= {} if s.measured_peak_db is None else {f"measured_{when}_db": s.measured_peak_db}
     for role, unit in _UNITS.items() if hover.passed else ():
@@ -459,9 +495,11 @@ def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]
         numbers |= {f"{role}_sd_before": was, f"{role}_sd_after": now}
     worse = numbers["peak_after_db"] > numbers["peak_before_db"]
     cautions = ("the new loop has a higher peak of the sensitivity than the one before; load rig.toml again",) * worse
+    refused, warned = _by_zone(loops["after"].sensitivity["x"].judged, "")
     return Step(
-        name="load", findings=tuple(findings), reasons=(*kept.reasons, *hover.reasons),
-        cautions=(*kept.cautions, *cautions), numbers=numbers, pictures=(measured_picture(loops), *hover.pictures),
+        name="load", findings=tuple(findings), reasons=(*kept.reasons, *hover.reasons, *refused),
+        cautions=(*kept.cautions, *cautions, *warned), numbers=numbers,
+        pictures=(measured_picture(loops), *hover.pictures),
     )  # fmt: skip
 
 

@@ -40,6 +40,7 @@ from ambid.control.design import (
 from ambid.control.drawn import Draws, Spread, draw_plants, laws_of, magnet_check, over_speeds
 from ambid.control.gain_sets import FORMS
 from ambid.control.verification import Trials, checks_of_verifications, verify_all
+from ambid.control.zones import zone_of
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -53,7 +54,6 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import by_name, check_whole
-from ambid.simulation.margins import zone_of
 
 _JUDGES = 200  # plants that judge a design
 _ROUNDS = 3  # in which the limits are met on the plants that judge too

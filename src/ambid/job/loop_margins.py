@@ -29,6 +29,7 @@ from ambid.control.margins import (
     speeds_of,
     synchronous,
 )
+from ambid.control.zones import zone_of
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -44,7 +45,6 @@ from ambid.rig import Rig
 from ambid.rotor.balance import Machine
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import saved, setting
-from ambid.simulation.margins import zone_of
 
 
 def margins(

@@ -15,6 +15,7 @@ from typing import Any
 from ambid.arrays import Array
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import EstimatedParameter, plain_json
+from ambid.estimation.modes import EstimatedNumber
 from ambid.recursive.lines import Track, is_vague
 from ambid.rig import Rig, rig_text
 from ambid.settings.caller import setting
@@ -170,12 +171,17 @@ def _time_of(about: Mapping[str, object]) -> float:
 
 
 def _parameters(result: Any) -> tuple[EstimatedParameter, ...]:
-    """Return the numbers of a result: its parameters, bending modes, and the peak of the sensitivity by axis."""
+    """Return the numbers of a result: parameters, bending modes, the sensitivity's peak by axis, also as measured."""
     numbers = [*getattr(result, "parameters", ()), *getattr(result, "mode_parameters", ())]
     for axis, s in (getattr(result, "sensitivity", None) or {}).items():
-        peak = plain_json(s)["peak_db"]
-        ends = dict(peak, ci95=tuple(peak["ci95"]))
-        numbers.append(EstimatedParameter(name=f"{axis}.sensitivity", unit="dB", role="free", **ends))
+        entry = plain_json(s)
+        peaks, top = {"sensitivity": entry["peak_db"]}, entry["measured_peak_db"]
+        if top is not None:
+            of_record = EstimatedNumber.of(top, entry.get("measured_sd_db") or 0.0, size=1.0)
+            peaks["sensitivity_measured"] = plain_json(of_record)
+        for name, peak in peaks.items():
+            ends = dict(peak, ci95=tuple(peak["ci95"]))
+            numbers.append(EstimatedParameter(name=f"{axis}.{name}", unit="dB", role="free", **ends))
     return tuple(numbers)
 
 

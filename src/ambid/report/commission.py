@@ -33,12 +33,12 @@ from ambid.report.drawing import (
     single,
     stacked,
 )
-from ambid.report.margins import sensitivity_panel, zone_lines
+from ambid.report.margins import sensitivity_panel
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import WIDTH, Cell, Line
 from ambid.settings.caller import command, setting
 from ambid.signals.spectra import power_spectrum
-from ambid.simulation.margins import ZONES, LoopMargins
+from ambid.simulation.margins import LoopMargins
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,6 +61,7 @@ class Step:
     numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)  # the same as numbers, SI
     pictures: tuple[Picture, ...] = ()  # what it saw
     text: str = ""  # more of it, as on a terminal
+    remedy: str = ""  # what to do after it where it is not what its kind of step asks for
 
     @property
     def passed(self) -> bool:
@@ -159,7 +160,7 @@ _BEGIN_S = 0.25  # of lift-off that is drawn closer
 
 _ROW = 1.5  # inches
 
-_DB = (-20.0, 16.0)
+_CIRCLE = 3.0  # sensitivity of the circle around -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,17 +240,19 @@ def trials_picture(
     )
 
 
-def margins_picture(loops: Mapping[str, LoopMargins]) -> Picture:
-    """Nyquist curve and sensitivity of loops by name, with the zones of ISO 14839-3."""
+def margins_picture(loops: Mapping[str, LoopMargins], margins: Margins | None) -> Picture:
+    """Nyquist curve of loops by name, and the sensitivity at the position within the zones of ISO 14839-3."""
+    caption = (
+        "Nyquist curve of the loop opened at the controller's output: the farther it stays from -1, the more gain and "
+        "phase may change; circle: a sensitivity of 3 there."
+    )
+    columns = [[panel(_nyquist, loops, height=3.2)]]
+    if margins is not None:
+        caption += " Sensitivity at the position, by which the loop is judged, with the zones of ISO 14839-3."
+        columns.append([panel(sensitivity_panel, margins, "x", height=3.2)])
+    widths = (2.0, 3.0)[: len(columns)]
     return Picture(
-        title="Margins of the loop",
-        caption="The loop opened at the controller's output. Nyquist curve: the farther it stays from -1, the more gain"
-        " and phase may change; circle: the distance of zone A. Sensitivity: with the zones of ISO 14839-3.",
-        block=Block(
-            columns=[[panel(_nyquist, loops, height=3.2)], [panel(_sensitivity, loops, height=3.2)]],
-            widths=(2.0, 3.0),
-            shared=False,
-        ),
+        title="Margins of the loop", caption=caption, block=Block(columns=columns, widths=widths, shared=False)
     )
 
 
@@ -340,28 +343,14 @@ def _nyquist(axes: Axes, loops: Mapping[str, LoopMargins]) -> None:
         axes.plot(loop.open_loop.real, loop.open_loop.imag, color=colour, linestyle=style, label=name)
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     axes.plot(np.cos(angle), np.sin(angle), color=MEASURED, linewidth=0.6, linestyle=":")
-    axes.plot(-1.0 + np.cos(angle) / ZONES[0][0], np.sin(angle) / ZONES[0][0], color=BOUND, linewidth=0.9)
+    axes.plot(-1.0 + np.cos(angle) / _CIRCLE, np.sin(angle) / _CIRCLE, color=BOUND, linewidth=0.9)
     axes.plot(-1.0, 0.0, "+", color=BOUND, markersize=10, markeredgewidth=1.6)
     axes.set_aspect("equal")
     axes.set_xlim(-3.0, 1.5)
     axes.set_ylim(-2.0, 2.0)
     axes.set_xlabel("real part of L")
     axes.set_ylabel("imaginary part of L")
-    head(axes, f"modulus margin {1.0 / max(loop.peak[0] for loop in loops.values()):.2f}")
-
-
-def _sensitivity(axes: Axes, loops: Mapping[str, LoopMargins]) -> None:
-    """Draw the sensitivity of loops over frequency."""
-    for loop, (colour, style) in zip(loops.values(), ((PREDICTED, "-"), (ORANGE, "--")), strict=False):
-        axes.plot(loop.frequency_hz, 20.0 * np.log10(loop.sensitivity), color=colour, linestyle=style)
-    zone_lines(axes)
-    peak, hz = next(iter(loops.values())).peak
-    first = next(iter(loops.values())).frequency_hz
-    log_axis(axes.xaxis, float(first[0]), float(first[-1]))
-    axes.set_ylim(_DB[0], max(_DB[1], 20.0 * math.log10(peak) + 2.0))
-    axes.set_xlabel("frequency [Hz]")
-    axes.set_ylabel("sensitivity [dB]")
-    head(axes, f"largest {20.0 * math.log10(peak):.1f} dB at {hz:.3g} Hz", good=peak < ZONES[-1][0])
+    head(axes, f"at the controller's output: modulus margin {1.0 / max(loop.peak[0] for loop in loops.values()):.2f}")
 
 
 def step_section(step: Step, place: str) -> Section:
@@ -381,13 +370,14 @@ def step_section(step: Step, place: str) -> Section:
 
 
 def next_text(
-    passed: bool, step: str, number: int, total: int, folder: str, *, command: str = "", width: int = WIDTH
-) -> str:
+    passed: bool, step: str, number: int, total: int, folder: str, *, command: str = "", remedy: str = "",
+    width: int = WIDTH,
+) -> str:  # fmt: skip
     """Say where a commissioning ended, and what to do next.
 
     `passed`: whether it came to its end; `step`: the last one; `number`, `total`: which of how many it is; `folder`:
-    where the files are; `command`: what is said to be run next, on a line of its own; `width`: columns of the terminal.
-    Returns lines without the last line's end.
+    where the files are; `command`: what is said to be run next, on a line of its own; `remedy`: the step's;
+    `width`: columns. Returns lines without the last line's end.
     """
     if passed:
         said = [
@@ -398,7 +388,7 @@ def next_text(
         said = [
             f"stopped at {step}, step {number} of {total}; the output is off, and {folder} holds what was found,"
             f" {folder}/report.html shows it.",
-            f"Next: {_next(step, folder)}. Then commission again, into another folder.",
+            f"Next: {remedy or _next(step, folder)}. Then commission again, into another folder.",
         ]
     lines = [line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False)]
     return "\n".join([*lines, *([f"  {command}"] if command else [])])

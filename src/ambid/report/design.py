@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.control.design import FIGURES, Design
+from ambid.control.design import FIGURES, Design, Situation
 from ambid.control.verification import KINDS, Case, Verification
+from ambid.control.zones import STANDARD, zone_of
 from ambid.estimation.result import RecordEntry
 from ambid.report.document import Document, Lines, Section, ending, grid, numbers_of
 from ambid.report.drawing import BOUND, MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
 from ambid.report.margins import opening_cells, zone_lines
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import title_line
-from ambid.simulation.margins import STANDARD, zone_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,13 +78,21 @@ def figure_text(name: str, x: float) -> str:
     return sized(x, {**FIGURES, "pole": "1/s"}[name])
 
 
+def _peak_of(situation: Situation) -> str:
+    zone = max((s.judged for s in situation.sensitivity.values()), key=lambda z: z.peak_db)
+    return f"{zone.peak_db:.2f} dB, {zone.words}"
+
+
 def _figures(d: Design) -> Section:
     rows: list[tuple[str, ...]] = [("", "before", "after", "worst before", "worst after")]
     for name, words in NAMES.items():
         sizes = [getattr(x, name) for s in (d.before, d.after) for x in (s.figures, s.worst)]
-        rows.append((words, *(figure_text(name, sizes[k]) for k in (0, 2, 1, 3))))
+        cells = [figure_text(name, sizes[k]) for k in (0, 2, 1, 3)]
+        if name == "peak":  # of the estimate it is known how well
+            cells[:2] = (_peak_of(s) for s in (d.before, d.after))
+        rows.append((words, *cells))
     if len(d.after.sensitivity) > 1:
-        both = (figure_text("peak", s.singular) for s in (d.before, d.after))
+        both = (f"{20.0 * np.log10(s.singular):.2f} dB" for s in (d.before, d.after))
         rows.append(("largest singular value", *both, "", ""))
     for quantity, unit in (("voltage", "V"), ("current", "A"), ("position", "m")):
         both_rms = [
@@ -95,7 +103,7 @@ def _figures(d: Design) -> Section:
     n = d.plants["verification"]
     stable = [f"{int(str(n)) - s.unstable} of {n}" for s in (d.before, d.after)]
     rows.append(("plants that are held", "", "", *stable))
-    note = f"in brackets: zones of {STANDARD}; check their limits against its text"
+    note = f"A to D: zones of {STANDARD}, of the estimate with probability; check their limits against its text"
     return Section(
         heading=[(f"both loops: on the estimate, and the worst of {n} plants around it", "strong")],
         parts=[grid(rows), Lines(lines=[note], wrap=False)],
@@ -183,11 +191,8 @@ def _sensitivity(axes: Axes, design: Design, axis: str) -> None:
     axes.set_ylabel("sensitivity [dB]")
     was, now = (s.sensitivity[axis] for s in (design.before, design.after))
     good = design.checks["zone"].passed
-    head(
-        axes,
-        f"axis {axis}: {was.peak_db.value:.1f} → {now.peak_db.value:.1f} dB, zone {was.zone} → {now.zone}",
-        good=good,
-    )
+    peaks = f"{was.peak_db.value:.1f} → {now.peak_db.value:.1f} dB"
+    head(axes, f"axis {axis}: {peaks}, zone {was.judged.words} → {now.judged.words}", good=good)
 
 
 def _over_speed(axes: Axes, design: Design) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import Curve, NonlinearBearingEstimate
+from ambid.control.zones import Zone
 from ambid.errors import counted
 from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.estimation.result import RecordEntry
@@ -311,11 +312,11 @@ def sensitivity_lines(sensitivity: Mapping[str, Any]) -> list[str]:
     for s in sensitivity.values():
         peak, measured = s["peak_db"], s["measured_peak_db"]
         at = f"{pure(peak['value'], peak['sd'] or 0.0)} dB at {sized(s['frequency_hz'], 'Hz')}"
-        line = f"sensitivity of the loop: {at}, zone {s['zone']} of ISO 14839-3"
+        line = f"sensitivity of the loop: {at}"
         if measured is not None:
             at = f"{pure(measured, s.get('measured_sd_db') or 0.0)} dB at {sized(s['measured_frequency_hz'], 'Hz')}"
             line += f"; measured {at}"
-        lines.append(line)
+        lines.append(f"{line}; zone {Zone.read(s).words} of ISO 14839-3")
     return lines
 
 

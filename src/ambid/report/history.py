@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.control.zones import Zone
 from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95
 from ambid.ledger.entry import Note
@@ -83,7 +84,7 @@ def history_sections(history: History) -> list[Section]:
         f"verdicts: {counts['usable']} usable, {counts['caution']} with caution, {counts['unusable']} not to be used",
     ]
     rows: list[tuple[str, ...]] = [("", "latest value ± sd", "taken", "since the first", "known")]
-    rows += [_row(s, n) for s in h.measured.values()]
+    rows += [_row(s, n, _zone(h, s)) for s in h.measured.values()]
     events: list[Line] = []
     for e in h.events[-_SHOWN:]:
         parameter = f"{e.parameter}: " if e.parameter else ""
@@ -100,7 +101,21 @@ def history_sections(history: History) -> list[Section]:
     ]
 
 
-def _row(s: Series, n: int) -> tuple[str, ...]:
+def _zone(h: History, s: Series) -> str:
+    """Say the zone of the latest peak of a sensitivity, nothing of another number."""
+    axis, _, what = s.name.rpartition(".")
+    finite = np.flatnonzero(np.isfinite(s.value))
+    if what != "sensitivity" or not finite.size:
+        return ""
+    z, measured = int(finite[-1]), h.measured.get(f"{axis}.sensitivity_measured")
+    pair = None
+    if measured is not None:
+        at = np.flatnonzero((measured.estimate == s.estimate[z]) & np.isfinite(measured.value))
+        pair = (float(measured.value[at[0]]), float(measured.sd[at[0]])) if at.size else None
+    return f", zone {Zone.of((float(s.value[z]), float(s.sd[z])), pair).words}"
+
+
+def _row(s: Series, n: int, zone: str) -> tuple[str, ...]:
     finite = np.flatnonzero(np.isfinite(s.value))
     count = f"{finite.size} of {n}"
     if not finite.size:
@@ -110,7 +125,7 @@ def _row(s: Series, n: int) -> tuple[str, ...]:
     change = ""
     if a != z and s.value[a]:
         change = percent(float(s.value[z] / s.value[a] - 1), math.hypot(s.sd[a], s.sd[z]) / abs(float(s.value[a])))
-    return s.name, latest, day(float(s.taken_at[z])), change, count
+    return s.name, latest + zone, day(float(s.taken_at[z])), change, count
 
 
 def bearings_text(bearings: Sequence[KnownBearing], failures: Iterable[Failure], *, paint: Paint = plain) -> str:

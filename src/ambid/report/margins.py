@@ -11,12 +11,12 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.control.margins import QUANTITIES, AxisSensitivity, Demand, Margins, Opening, Vibration
+from ambid.control.zones import LONG_TERM, STANDARD, ZONES
 from ambid.estimation.result import RecordEntry
 from ambid.report.document import Document, Lines, Section, ending, grid, numbers_of
 from ambid.report.drawing import BOUND, MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import pure, title_line
-from ambid.simulation.margins import STANDARD, ZONES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,11 +78,14 @@ def _sensitivity(m: Margins) -> Section:
     for axis, s in m.sensitivity.items():
         peak = f"{pure(s.peak_db.value, s.peak_db.sd)} dB"
         wide = _NONE if s.bandwidth_hz is None else sized(s.bandwidth_hz, "Hz")
-        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.zone, _measured(s), wide))
+        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.judged.words, _measured(s), wide))
     limits = m.standard["limits_db"]
     assert isinstance(limits, list | tuple)
     ends = " and ".join([", ".join(f"{x:g}" for x in limits[:-1]), f"{limits[-1]:g}"])
-    lines = [f"zones end at {ends} dB; check these limits against the text of the standard"]
+    lines = [
+        f"zones end at {ends} dB; check these limits against the text of the standard",
+        "a zone is that of the measured peak where there is one, by its 95 % interval",
+    ]
     if len(m.sensitivity) > 1:
         top, hz = (float(str(m.largest_singular[name])) for name in ("peak_db", "frequency_hz"))
         lines.append(f"all axes together, largest singular value: {top:.2f} dB at {sized(hz, 'Hz')}")
@@ -196,8 +199,9 @@ def sensitivity_panel(axes: Axes, margins: Margins, axis: str) -> None:
     axes.set_ylim(_DB[0], max(_DB[1], s.peak_db.value + 2.0))
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("sensitivity [dB]")
-    good = margins.checks["zone"].passed or s.zone in "AB"
-    head(axes, f"axis {axis}: {s.peak_db.value:.2f} dB at {s.frequency_hz:.3g} Hz, zone {s.zone}", good=good)
+    zone = s.judged
+    good, hz = zone.worst in LONG_TERM, s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
+    head(axes, f"axis {axis}: {zone.source} {zone.peak_db:.2f} dB at {hz:.3g} Hz, zone {zone.words}", good=good)
 
 
 def _compliance(axes: Axes, margins: Margins, axis: str) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+from ambid.control.zones import Zone
 from ambid.estimation.estimate import EstimatedParameter
 from ambid.estimation.result import RecordEntry
 from ambid.physics.rotor_model import Bearing, position_role
@@ -240,7 +241,7 @@ def _loop(sensitivity: dict[str, object]) -> str:
     """The peak of an axis' sensitivity and its zone by ISO 14839-3."""
     peak = sensitivity["peak_db"]
     assert isinstance(peak, dict)
-    return f"{pure(float(peak['value']), float(peak['sd'] or 0.0))} dB, zone {sensitivity['zone']}"
+    return f"{pure(float(peak['value']), float(peak['sd'] or 0.0))} dB, zone {Zone.read(sensitivity).words}"
 
 
 def _plane(what: str) -> str:

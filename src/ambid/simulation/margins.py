@@ -1,5 +1,6 @@
 """Margins of a position loop as predicted: poles, gain, phase, sensitivity; and a refusal. Opened at the controller's
-output: L = 1/S - 1, S from an excitation to the command (ISO 14839-3). Limits and quantisation are left out.
+output: L = 1/S - 1, S from an excitation to the command; ISO 14839-3 opens it at the position (`control/zones.py`).
+Limits and quantisation are left out.
 """
 
 from __future__ import annotations
@@ -18,17 +19,6 @@ from ambid.settings.caller import setting
 from ambid.simulation.plant import closed_loop_poles, excited_loop
 
 Complex = NDArray[np.complex128]
-
-ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"))
-"""Largest peak of the sensitivity of each zone of ISO 14839-3, as a ratio (9.54, 12.04, 13.98 dB); beyond is zone D."""
-STANDARD = "ISO 14839-3:2006"
-"""The edition that `ZONES` are of; users are asked to check them against its text."""
-
-
-def zone_of(peak: float) -> str:
-    """Return the zone of ISO 14839-3 of a peak of the sensitivity, ``"A"`` to ``"D"``."""
-    return next((zone for most, zone in ZONES if peak < most), "D")
-
 
 _REACH = 20.0  # factor on the gains that is looked at, up and down
 _GAINS = 81  # of them, even in the logarithm
@@ -56,11 +46,6 @@ class OpenLoop:
         """Largest modulus of S (its inverse is the modulus margin), and its frequency in Hz."""
         k = int(np.argmax(self.sensitivity))
         return float(self.sensitivity[k]), float(self.frequency_hz[k])
-
-    @property
-    def zone(self) -> str:
-        """Zone of ISO 14839-3, ``"A"`` to ``"D"``."""
-        return zone_of(self.peak[0])
 
     @property
     def phase_deg(self) -> float | None:
@@ -130,8 +115,8 @@ class LoopMargins(OpenLoop):
         phase = "" if self.phase_deg is None else f", phase margin {self.phase_deg:.0f}°"
         peak, hz = self.peak
         return (
-            f"largest pole {self.largest_pole:.4f}, stable for {low} to {high} times the gains{phase}, sensitivity peak"
-            f" {20 * math.log10(peak):.1f} dB at {hz:.3g} Hz (ISO 14839-3 zone {self.zone})"
+            f"largest pole {self.largest_pole:.4f}, stable for {low} to {high} times the gains{phase}, peak of the"
+            f" sensitivity at the controller's output {20 * math.log10(peak):.1f} dB at {hz:.3g} Hz"
         )
 
     def refuse(self, where: str, *, remedy: str) -> None:
