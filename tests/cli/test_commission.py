@@ -1,5 +1,6 @@
 """``ambid commission``: a paragraph a step, where it stopped and what to do next, an exit code for each way to end."""
 
+import html
 import json
 import os
 import shlex
@@ -10,7 +11,10 @@ import pytest
 
 from ambid import job
 from ambid.acquisition.device import DeviceInfo
+from ambid.console.runs import Run
+from ambid.console.worker import Worker, _commission
 from ambid.job.commissioning import FILES, REDESIGNED
+from ambid.job.presentation import page
 from tests.firmware.conftest import avr_gcc, bench_program, firmware_elf, native_cc
 from tests.job.benches import COIL, PROTOTYPE_FILE, Spoiled, prototype
 
@@ -107,6 +111,59 @@ def test_one_that_is_not_good_enough_ends_with_3_where_why_and_what_next(commiss
     assert "Then commission again, into another folder." in text
     assert told()["passed"] is False
     assert files() == {"rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "commission.json"}
+
+
+def reasons_of(text):
+    """The verdict and its reasons as a terminal has them, each on one line."""
+    lines = text[text.index("verdict: ") :].splitlines()
+    reasons = []
+    for line in lines[1:]:
+        if line.startswith("  ✗ "):
+            reasons.append(line.removeprefix("  ✗ "))
+        elif line.startswith("    "):
+            reasons[-1] += " " + line.strip()
+        else:
+            break
+    return lines[0].removeprefix("verdict: "), reasons
+
+
+@pytest.mark.parametrize(("kp", "code"), [(15532.0, 3), (19415.0, 0)])
+def test_terminal_file_page_and_console_say_one_verdict_with_the_same_reasons(
+    commission, ambid, place, monkeypatch, kp, code
+):
+    monkeypatch.setattr("ambid.job.commissioning.page", page)
+    monkeypatch.setattr(Worker, "agreed", lambda *_: True)
+    rig = (place / "rig.toml").read_text(encoding="utf-8").replace("kp = 19415.0", f"kp = {kp}")
+    (place / "rig.toml").write_text(rig, encoding="utf-8")
+    done = commission("--seconds", "4", "--track-seconds", "2")
+    assert done.code == code, done.err
+    verdict = told()["verdict"]
+    word = {"usable": "usable", "caution": "use with caution", "unusable": "do not use"}[verdict["word"]]
+    reasons = [f"{r['check']}: {r['text']}" for r in verdict["reasons"]]
+    assert reasons_of(done.out) == (word, reasons)
+    above = html.unescape((place / "out" / "report.html").read_text(encoding="utf-8")).split("<h2>")[0]
+    assert f">{word}</span>" in above
+    assert all(r["text"] in " ".join(above.split()) for r in verdict["reasons"])
+    seen = []
+    run = Run(place / "run")
+    run.place.mkdir()
+    spec = {"job": "commission", "folder": str(place), "rig": "rig.toml", "port": "simulated", "out": "shown"}
+    (run.place / "spec.json").write_text(json.dumps({**spec, "seconds": 4.0, "track_seconds": 2.0}))
+    worker = Worker(run)
+    worker.feed.tell = lambda kind, content=None, **_: seen.append((kind, content))
+    _commission(worker)
+    shown = next(content for kind, content in seen if kind == "commissioned")
+    own = told("shown")["verdict"]  # settings have the console's names there
+    assert (shown["verdict"], shown["reasons"]) == (own["word"], [f"{r['check']}: {r['text']}" for r in own["reasons"]])
+    assert own["word"] == verdict["word"]
+    assert [r["text"].replace("redesign", "--redesign") for r in own["reasons"]] == [
+        r["text"] for r in verdict["reasons"]
+    ]
+    if code:
+        assert "zone D" in reasons[0]
+        better = ambid(*shlex.split(done.out.splitlines()[-1])[1:], "--help")  # the line is a command's
+        assert better.code == 0
+        assert "ambid design controller" in done.out.splitlines()[-1]
 
 
 def test_the_folder_of_an_earlier_one_is_refused_before_the_bench_is_opened(commission, place, monkeypatch):

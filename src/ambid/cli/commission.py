@@ -40,6 +40,7 @@ def command(v: Values) -> None:
     from ambid.report.commission import next_text, step_section
     from ambid.report.device import progress_line
     from ambid.report.document import sections_text
+    from ambid.report.text import verdict_lines
     from ambid.rig import load_rig
 
     outputs = Outputs(v.rig, **v.outputs)
@@ -127,16 +128,22 @@ def command(v: Values) -> None:
             "-o": v.out / "next.h5",
         }  # fmt: skip
         command = _line("acquire", given) + (" --force" if v.force else "")
+    elif last[-1].remedy:
+        command = _line("design controller", {"": v.out / "estimate.json", "--rig": v.rig, "-o": v.out / "better.toml"})
     elif name == "identify":
         command = _line("identify", {"": v.out / "record.h5", "--rig": v.rig})
-    typer.echo(next_text(passed, name, len(last), len(plan.steps), str(v.out), command=command), err=v.json == "-")
+    typer.echo("\n".join(verdict_lines(done.verdict, paint=paint)), err=v.json == "-")
+    said = next_text(
+        passed, name, len(last), len(plan.steps), str(v.out), command=command, remedy=last[-1].remedy
+    )  # fmt: skip
+    typer.echo(said, err=v.json == "-")
     end(failed=not passed)
 
 
 def _line(verb: str, given: Mapping[str, object]) -> str:
     """Write a command as a shell takes it, with the options that are given."""
     words = [w for name, value in given.items() if value is not None for w in (name, str(value)) if w]
-    return shlex.join(["ambid", verb, *words])
+    return shlex.join(["ambid", *verb.split(), *words])
 
 
 def _second_s(seconds: float) -> float:

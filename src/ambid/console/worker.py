@@ -449,7 +449,7 @@ def _commission(worker: Worker) -> None:
                 on_begin=lambda name: worker.feed.tell("beginning", {"name": name}, sticky="beginning"),
                 on_step=step, on_progress=progress, tick=worker.show,
             )  # fmt: skip
-            reasons = [r.text for r in found.verdict.reasons]
+            reasons = [f"{r.check}: {r.text}" for r in found.verdict.reasons]
             told = {"passed": found.passed, "verdict": found.verdict.word, "reasons": reasons}
         finally:
             reached = ", ".join(good) or "none"
