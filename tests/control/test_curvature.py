@@ -85,9 +85,9 @@ def test_what_an_interval_cannot_bear_is_a_caution():
         ({"L": 1.9, "k_x": 0.1}, {"L": 4e-3, "k_x": 1.0}, False),  # 5 %
         ({"L": 3.5, "k_x": 0.1}, {"L": 4e-5, "k_x": 1.0}, False),  # what is of higher degree moves it too
     ):
-        assert judge_shift(shift, size, theta, held=True)[0] == passed, (shift, size)
+        assert judge_shift(shift, size, theta, in_interval=True)[0] == passed, (shift, size)
         assert not (
-            abs(shift["L"]) > MOST and judge_shift(shift, size, theta, held=False)[0]
+            abs(shift["L"]) > MOST and judge_shift(shift, size, theta, in_interval=False)[0]
         )  # a design can be smaller
 
 

@@ -108,7 +108,9 @@ def magnet_checks(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Arr
         counted = float(laws[""].known and (part > 0.5 or part_sd > _UNTOLD))
     names = fit.problem.estimated
     values = dict(zip(names, (counted * shift / sd).tolist(), strict=True))
-    passed, text = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta, held=True)
+    passed, text = judge_shift(
+        values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta, in_interval=True
+    )
     if not passed:
         text += f" ({assumed[0]}; the record shows {part:.2g} ± {part_sd:.2g} of it)"
         text += (
@@ -128,10 +130,10 @@ def advised(shift: Mapping[str, float]) -> float:
 
 
 def judge_shift(
-    shift: Mapping[str, float], size: Mapping[str, float], theta: Mapping[str, float], *, held: bool
+    shift: Mapping[str, float], size: Mapping[str, float], theta: Mapping[str, float], *, in_interval: bool
 ) -> tuple[bool, str]:
-    """Return whether shifts in sd are small, or `held` by intervals that can bear them, and what is said of them;
-    `size`: SI. A design, whose excitation can still be smaller, has no such intervals.
+    """Return whether shifts in sd are small, or part of intervals that can bear them (`in_interval`: not of a design,
+    whose excitation can still be smaller), and what is said of them; `size`: SI.
     """
     worst = sorted(shift, key=lambda name: -abs(shift[name]))
     far = [name for name in worst if abs(shift[name]) > MOST]
@@ -139,7 +141,7 @@ def judge_shift(
         most = f"{worst[0]} by {shift[worst[0]]:+.2f} sd"
         return True, f"over this motion the magnet's curvature moves no number far ({most} at most)"
     half = {n: NORMAL_95 * abs(size[n]) * np.hypot(1.0, 1.0 / shift[n]) for n in far}
-    borne = held and all(abs(shift[n]) <= _HELD and half[n] <= _WIDE * abs(theta[n]) for n in far)
+    small = in_interval and all(abs(shift[n]) <= _HELD and half[n] <= _WIDE * abs(theta[n]) for n in far)
     listed = ", ".join(f"{n} by {shift[n]:+.1f} sd ({100.0 * size[n] / abs(theta[n]):+.2g} %)" for n in far)
     text = f"over this motion the magnet's curvature moves {listed} from the value at the operating point"
-    return borne, f"{text}; the intervals hold it" if borne else text
+    return small, f"{text}; the intervals hold it" if small else text

@@ -239,7 +239,7 @@ class AxisSensitivity:
     zone_from: Literal["measured", "predicted"] = "predicted"  # the peak that the zone is of
 
     @property
-    def judged(self) -> Zone:
+    def rating(self) -> Zone:
         """The zone with the peak that counts."""
         return Zone.of((self.peak_db.value, self.peak_db.sd), self.measured)
 
@@ -510,8 +510,8 @@ def _band(sensitivity: Mapping[str, AxisSensitivity], band_hz: tuple[float, floa
 
 def _zone(sensitivity: Mapping[str, AxisSensitivity]) -> Check:
     """Judge the upper ends of the peaks' 95 % intervals by ISO 14839-3."""
-    axis, s = max(sensitivity.items(), key=lambda x: x[1].judged.upper_db)
-    zone = s.judged
+    axis, s = max(sensitivity.items(), key=lambda x: x[1].rating.upper_db)
+    zone = s.rating
     hz = s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
     peak = f"{zone.peak_db:.1f} dB at {hz:.3g} Hz (axis {axis}, {zone.source}), zone {zone.words}"
     good = zone.worst in LONG_TERM

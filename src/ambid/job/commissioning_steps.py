@@ -430,9 +430,9 @@ def identification(
         reasons.append(f"the sensitivity at the position is not known, and the loop cannot be judged: {why}")
     for zone in map(Zone.read, estimate.sensitivity.values()):
         numbers |= {"sensitivity_db": zone.peak_db, "sensitivity_upper_db": zone.upper_db}
-        refused, warned = _by_zone(zone, "" if plan.redesign else _offer())
-        remedy = "design a better loop, and load that" if refused and not reasons else ""
-        reasons, cautions = [*reasons, *refused], [*cautions, *warned]
+        against, notes = _by_zone(zone, "" if plan.redesign else _offer())
+        remedy = "design a better loop, and load that" if against and not reasons else ""
+        reasons, cautions = [*reasons, *against], [*cautions, *notes]
     return Step(
         name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
         pictures=(margins_picture(loops, margins),) if loops else (), remedy=remedy,
@@ -486,7 +486,7 @@ def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]
     for (name, of), when in zip(loops.items(), ("before", "after"), strict=True):
         s = of.sensitivity["x"]
         seen = "" if s.measured is None else f", measured {pure(*s.measured)} dB"
-        findings.append(f"{name}: peak of the sensitivity {s.peak_db.value:.2f} dB{seen}, zone {s.judged.words}")
+        findings.append(f"{name}: peak of the sensitivity {s.peak_db.value:.2f} dB{seen}, zone {s.rating.words}")
         numbers |= {f"peak_{when}_db": s.peak_db.value}
         numbers |= {} if s.measured_peak_db is None else {f"measured_{when}_db": s.measured_peak_db}
     for role, unit in _UNITS.items() if hover.passed else ():
@@ -495,10 +495,10 @@ def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]
         numbers |= {f"{role}_sd_before": was, f"{role}_sd_after": now}
     worse = numbers["peak_after_db"] > numbers["peak_before_db"]
     cautions = ("the new loop has a higher peak of the sensitivity than the one before; load rig.toml again",) * worse
-    refused, warned = _by_zone(loops["after"].sensitivity["x"].judged, "")
+    against, notes = _by_zone(loops["after"].sensitivity["x"].rating, "")
     return Step(
-        name="load", findings=tuple(findings), reasons=(*kept.reasons, *hover.reasons, *refused),
-        cautions=(*kept.cautions, *cautions, *warned), numbers=numbers,
+        name="load", findings=tuple(findings), reasons=(*kept.reasons, *hover.reasons, *against),
+        cautions=(*kept.cautions, *cautions, *notes), numbers=numbers,
         pictures=(measured_picture(loops), *hover.pictures),
     )  # fmt: skip
 

@@ -626,7 +626,7 @@ def _curvature(expected: Mapping[str, Expected], assumed: str) -> Check:
     """Judge what curvature will move."""
     shift = {name: x.shift for name, x in expected.items() if x.shift is not None and not name.endswith(".delay")}
     size = {name: far * expected[name].sd for name, far in shift.items()}
-    passed, said = judge_shift(shift, size, {name: expected[name].value for name in shift}, held=False)
+    passed, said = judge_shift(shift, size, {name: expected[name].value for name in shift}, in_interval=False)
     if not passed:
         said += (
             f" ({assumed}). Play {advised(shift):.2g} of it or less ({setting('use')}), or identify with "

@@ -79,7 +79,7 @@ def figure_text(name: str, x: float) -> str:
 
 
 def _peak_of(situation: Situation) -> str:
-    zone = max((s.judged for s in situation.sensitivity.values()), key=lambda z: z.peak_db)
+    zone = max((s.rating for s in situation.sensitivity.values()), key=lambda z: z.peak_db)
     return f"{zone.peak_db:.2f} dB, {zone.words}"
 
 
@@ -192,7 +192,7 @@ def _sensitivity(axes: Axes, design: Design, axis: str) -> None:
     was, now = (s.sensitivity[axis] for s in (design.before, design.after))
     good = design.checks["zone"].passed
     peaks = f"{was.peak_db.value:.1f} → {now.peak_db.value:.1f} dB"
-    head(axes, f"axis {axis}: {peaks}, zone {was.judged.words} → {now.judged.words}", good=good)
+    head(axes, f"axis {axis}: {peaks}, zone {was.rating.words} → {now.rating.words}", good=good)
 
 
 def _over_speed(axes: Axes, design: Design) -> None:

@@ -78,7 +78,7 @@ def _sensitivity(m: Margins) -> Section:
     for axis, s in m.sensitivity.items():
         peak = f"{pure(s.peak_db.value, s.peak_db.sd)} dB"
         wide = _NONE if s.bandwidth_hz is None else sized(s.bandwidth_hz, "Hz")
-        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.judged.words, _measured(s), wide))
+        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.rating.words, _measured(s), wide))
     limits = m.standard["limits_db"]
     assert isinstance(limits, list | tuple)
     ends = " and ".join([", ".join(f"{x:g}" for x in limits[:-1]), f"{limits[-1]:g}"])
@@ -199,7 +199,7 @@ def sensitivity_panel(axes: Axes, margins: Margins, axis: str) -> None:
     axes.set_ylim(_DB[0], max(_DB[1], s.peak_db.value + 2.0))
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("sensitivity [dB]")
-    zone = s.judged
+    zone = s.rating
     good, hz = zone.worst in LONG_TERM, s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
     head(axes, f"axis {axis}: {zone.source} {zone.peak_db:.2f} dB at {hz:.3g} Hz, zone {zone.words}", good=good)
 
