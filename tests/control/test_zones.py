@@ -51,7 +51,7 @@ def test_of_draws_of_a_peak_as_many_lie_in_a_zone_as_it_says():
 
 def test_the_words_are_a_letter_with_its_probability_or_two_letters():
     assert zone(9.466, 0.037).words == "A (98 %)"
-    assert zone(5.0, 0.1).words == "A (> 99.9 %)"
+    assert zone(5.0, 0.1).words == "A (> 99 %)"
     assert zone(9.496, 0.080).words == "A or B"
     assert zone(9.5).words == "A"
 

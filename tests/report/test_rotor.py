@@ -33,6 +33,8 @@ def test_a_rotor_has_one_table_for_itself_and_one_for_each_bearing() -> None:
                                       ["bearing", "B", "bx", "by"]]  # fmt: skip
     (k_x, _) = (line for line in lines if line.startswith("k_x"))
     assert [float(x) for x in k_x.split()[1:7:3][:1]] == [round(e["ax.k_x"].value / 1e3, 1)]
+    loops = [line for line in lines if line.startswith("sensitivity")]
+    assert [line.count(" dB, A (> 99 %)") for line in loops] == [2, 2]  # the zone of each axis
     assert any(line.split() == ["sensor", "plane", "45", "mm,", "fixed"] for line in lines)
     narrow = e.summary(width=60).splitlines()
     assert sum(line.startswith("bearing A") for line in narrow) == 2  # an axis each

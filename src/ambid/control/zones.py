@@ -17,7 +17,7 @@ STANDARD = "ISO 14839-3:2006"
 """The edition that `ZONES` are of; users are asked to check them against its text."""
 LONG_TERM = "AB"
 """Zones for operation without limit of time."""
-_SURE = 0.999  # probability that is not told more exactly
+_SURE = 0.99  # probability that is not told more exactly
 
 
 def zone_of(peak: float) -> str:
@@ -99,4 +99,4 @@ class Zone:
         if len(self.letters) > 1 or probability is None:
             return self.letters
         p = probability[self.letters]
-        return f"{self.letters} ({f'{100.0 * p:.{int(p >= 0.99)}f}' if p < _SURE else '> 99.9'} %)"
+        return f"{self.letters} ({f'{100.0 * p:.0f}' if p < _SURE else '> 99'} %)"

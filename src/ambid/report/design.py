@@ -78,9 +78,8 @@ def figure_text(name: str, x: float) -> str:
     return sized(x, {**FIGURES, "pole": "1/s"}[name])
 
 
-def _peak_of(situation: Situation) -> str:
-    zone = max((s.rating for s in situation.sensitivity.values()), key=lambda z: z.peak_db)
-    return f"{zone.peak_db:.2f} dB, {zone.words}"
+def _zone_of(situation: Situation) -> str:
+    return max((s.rating for s in situation.sensitivity.values()), key=lambda z: z.peak_db).words
 
 
 def _figures(d: Design) -> Section:
@@ -89,8 +88,10 @@ def _figures(d: Design) -> Section:
         sizes = [getattr(x, name) for s in (d.before, d.after) for x in (s.figures, s.worst)]
         cells = [figure_text(name, sizes[k]) for k in (0, 2, 1, 3)]
         if name == "peak":  # of the estimate it is known how well
-            cells[:2] = (_peak_of(s) for s in (d.before, d.after))
+            cells[:2] = (f"{20.0 * np.log10(sizes[k]):.2f} dB" for k in (0, 2))
         rows.append((words, *cells))
+        if name == "peak":
+            rows.append(("its zone", *(_zone_of(s) for s in (d.before, d.after)), "", ""))
     if len(d.after.sensitivity) > 1:
         both = (f"{20.0 * np.log10(s.singular):.2f} dB" for s in (d.before, d.after))
         rows.append(("largest singular value", *both, "", ""))
@@ -103,7 +104,7 @@ def _figures(d: Design) -> Section:
     n = d.plants["verification"]
     stable = [f"{int(str(n)) - s.unstable} of {n}" for s in (d.before, d.after)]
     rows.append(("plants that are held", "", "", *stable))
-    note = f"A to D: zones of {STANDARD}, of the estimate with probability; check their limits against its text"
+    note = f"A to D: zones of {STANDARD}; check their limits against its text"
     return Section(
         heading=[(f"both loops: on the estimate, and the worst of {n} plants around it", "strong")],
         parts=[grid(rows), Lines(lines=[note], wrap=False)],

@@ -241,7 +241,7 @@ def _loop(sensitivity: dict[str, object]) -> str:
     """The peak of an axis' sensitivity and its zone by ISO 14839-3."""
     peak = sensitivity["peak_db"]
     assert isinstance(peak, dict)
-    return f"{pure(float(peak['value']), float(peak['sd'] or 0.0))} dB, zone {Zone.read(sensitivity).words}"
+    return f"{pure(float(peak['value']), float(peak['sd'] or 0.0))} dB, {Zone.read(sensitivity).words}"
 
 
 def _plane(what: str) -> str:
