@@ -16,7 +16,7 @@ from ambid.physics.presets import preset
 from ambid.record import Record
 from ambid.rig import Rig, rig_of_preset
 from ambid.rotor.lines import Line, apart
-from ambid.rotor.scores import Cause, Score, agreement_checks
+from ambid.rotor.scores import Cause, Score, agreement_checks, scored
 from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
@@ -60,8 +60,7 @@ def test_the_gain_of_a_current_or_voltage_is_named_and_no_position_blamed(sound:
 
 def test_the_lag_of_a_current_is_named_and_no_mode_stands_in_for_it(sound: Any) -> None:
     record, rig = sound
-    late = np.exp(-2.0 * np.pi * 2000.0 / record.rate_hz)
-    lagging = changed(record, ax_current=lambda x: lfilter([1.0 - late], [1.0, -late], x, zi=[late * x[0]])[0])
+    lagging = filtered(record, "ax_current", 2000.0)
     causes = named(lagging, rig, "sensors_agree")
     assert causes[0] in ("ax_current.lag", "ax_voltage.lag")
     assert set(causes) <= {"ax_current.lag", "ax_voltage.lag"}
@@ -85,7 +84,7 @@ def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:
 def test_a_late_current_is_late_where_it_is_the_input(sound: Any) -> None:
     record, rig = sound
     pole = np.exp(-2.0 * np.pi * 2000.0 / record.rate_hz)
-    late = changed(record, ax_current=lambda x: lfilter([1.0 - pole], [1.0, -pole], x, zi=[pole * x[0]])[0])
+    late = filtered(record, "ax_current", 2000.0)
     check = ambid.identify(late, driven(rig, 6.0)).checks["sensors_agree"]
     assert (check.passed, check.cause) == (False, "ax_current.lag")
     assert check.size == pytest.approx(pole / (1.0 - pole) / record.rate_hz, rel=0.1)
@@ -119,6 +118,49 @@ def test_a_plane_and_a_gain_are_named_without_whole_periods(sound: Any) -> None:
     assert {"A.z", "A.z_sensor"} >= set(named(record, moved(rig, A__z_sensor=5e-3), "fixed_agree"))
     causes = named(changed(record, ax_position=lambda x: 1.05 * x), rig, "sensors_agree")
     assert causes[0] == "ax_position.gain"
+
+
+def filtered(record: Record, role: str, hertz: float) -> Record:
+    late = np.exp(-2.0 * np.pi * hertz / record.rate_hz)
+    return changed(record, **{role: lambda x: lfilter([1.0 - late], [1.0, -late], x, zi=[late * x[0]])[0]})
+
+
+@pytest.mark.parametrize("logs_a", [False, True])
+def test_solid_iron_is_named_and_within_the_intervals(monkeypatch: Any, logs_a: bool) -> None:
+    bench = replace(truth.BENCHES["rigid"], period=0.25)
+    rig = free_rig(replace(bench, eddy_pole_hz=3000.0) if logs_a else bench)
+    plain = truth.plant
+    monkeypatch.setattr(truth, "plant", lambda b: iron(*plain(b)))
+    found = ambid.identify(record_of(bench, 1), rig)
+    check = found.checks["sensors_agree"]
+    assert (found.verdict.word, check.cause) == ("caution", "solid_iron"), check.detail
+    for name, right in {"m": bench.m, "Id": bench.Id, "ax.k_i": bench.k_i[0], "by.L": bench.L[3]}.items():
+        assert abs(found[name].value - right) < 2.5 * found[name].sd < 0.3 * right, name
+
+
+def iron(A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
+    """The plant of a rigid rotor whose forces lose what poles of many decades pass on, as (s/w)^0.5 does."""
+    n, poles, current = A.shape[0], 2.0 * np.pi * np.geomspace(3.0, 3e5, 11), slice(8, 12)
+    share = 0.04 * np.sqrt(poles / poles[6])
+    big, into = np.zeros((n + 44, n + 44)), np.zeros((n + 44, B.shape[1]))
+    big[44:, 44:], into[44:] = A, B
+    force = A[:8, current]
+    big[44:52, 52:56] -= share.sum() * force
+    for k, (pole, part) in enumerate(zip(poles, share, strict=True)):
+        own = slice(4 * k, 4 * k + 4)
+        big[own, own], big[own, 52:56], big[44:52, own] = -pole * np.eye(4), pole * np.eye(4), part * force
+    return big, into, np.hstack([np.zeros((8, 44)), C])
+
+
+def test_a_score_does_not_depend_on_slopes_that_are_nearly_alike() -> None:
+    rng = np.random.default_rng(1)
+    J, c, r = rng.standard_normal((200, 6)), rng.standard_normal((200, 1)), rng.standard_normal(200)
+    cause = (Cause(name="A.z", kind="fixed"),)
+    plain = scored(cause, c + J[:, :1], J, r + 2.0 * c[:, 0], 200)[0]
+    alike = scored(cause, c + J[:, :1], np.column_stack([J, J[:, 0] + 1e-9 * J[:, 1]]), r + 2.0 * c[:, 0], 200)[0]
+    assert alike.z == pytest.approx(plain.z, rel=1e-6)
+    assert plain.size == pytest.approx(2.0, abs=0.3)
+    assert plain.shift[0] == pytest.approx(plain.size, rel=0.2)  # what the first slope takes up of the cause
 
 
 @pytest.mark.parametrize(("at", "logged"), [(0.35, True), (0.8, True), (0.35, False)])

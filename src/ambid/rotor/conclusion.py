@@ -19,7 +19,7 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
 from ambid.rotor.prediction import PredictorFit
-from ambid.rotor.scores import Bent, agreement_checks, curvature, curvature_check, refined, scores
+from ambid.rotor.scores import Bent, Score, agreement_checks, curvature, curvature_check, refined, scores, suspects
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
@@ -79,6 +79,7 @@ class Evidence:
     fit: Mapping[str, OutputFit]
     checks: Mapping[str, Check]
     bent: Bent | None = None  # what curvature has done to the numbers
+    shifts: Sequence[Array] = ()  # what causes that are named have done to them, in order of `Numbers.names`
 
 
 def of_periods(fit: RotorFit) -> Evidence:
@@ -94,12 +95,25 @@ def of_periods(fit: RotorFit) -> Evidence:
         noise=_noise(fit),
         fit=_fits(fit),
         bent=bent,
+        shifts=shifts_of(fit, found),
         checks={
             **_residual_checks(fit),
             **({"curvature": curvature_check(bent, sd)} if bent else {}),
             **agree,
         },
     )
+
+
+def shifts_of(fit: Ending, found: Sequence[Score]) -> list[Array]:
+    """Return by how much each cause that is named has moved the numbers, and how far that is known."""
+    names, chain = fit.unknowns.chain(fit.vector)
+    free, n, shifts = list(fit.unknowns.free_delays), fit.vector.size, list[Array]()
+    for s in suspects(found):
+        points = (fit.point, replace(fit, vector=fit.vector - s.shift[:n]).point)
+        is_now, would_be = (np.array([*(p.theta[x] for x in names), *p.delays[free]]) for p in points)
+        spread = chain[[*range(len(names)), *(len(names) + k for k in free)]] @ s.spread[:n]
+        shifts += [is_now - would_be, spread]
+    return shifts
 
 
 def lines_seen(fit: RotorFit | PredictorFit) -> list[Lines]:
@@ -130,6 +144,8 @@ def conclude(
     numbers, model = (of_record := numbers_of(fit)), fit.model
     if evidence.bent is not None:
         numbers = numbers.wider(tuple(evidence.bent.shift), evidence.bent.more)
+    for x in evidence.shifts:
+        numbers = numbers.wider(numbers.names, np.outer(x, x))
     estimated = _parameters(model, parameters, numbers, of_record)
     checks = {**evidence.checks, "identifiable": _identifiable(estimated, numbers), **more_checks}
     speed = max(fit.speeds, key=abs)

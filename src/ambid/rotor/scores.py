@@ -5,7 +5,7 @@ r/|c⊥|, size = c⊥ᵀ r/|c⊥|², c⊥ a cause's column outside the Jacobian'
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -18,6 +18,7 @@ from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import SensorError, electrical_errors, logged_error, position_errors
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, sampled
+from ambid.rotor.response import Sampled
 from ambid.rotor.spectra import PeriodSpectra
 from ambid.rotor.unknowns import Unknowns
 
@@ -33,28 +34,31 @@ _TOGETHER = {"position": "positions", "current": "currents", "voltage": "voltage
 _TWINS = (
     ("_current.lag", "_voltage.lag"), ("_voltage.lag", "_current.lag"),
     ("currents.lag", "voltages.lag"), ("voltages.lag", "currents.lag"),
-    ("positions.lag", "eddy_pole"), ("eddy_pole", "positions.lag"),
+    ("positions.lag", "eddy_pole"), ("eddy_pole", "positions.lag"), ("solid_iron", "eddy_pole"),
 )  # fmt: skip
 """Lags that look alike in most records."""
+_LATE = ("lag", "eddy", "iron")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
     """Errors of one size that have one cause."""
 
-    name: str  # as `Check.cause`: "ax_current.gain", "A.z", "A.z+A.z_sensor", "positions.lag", "eddy_pole"
-    kind: str  # "fixed", "gain", "lag", "cross-talk", "eddy"
+    name: str  # as `Check.cause`: "ax_current.gain", "A.z", "A.z+A.z_sensor", "positions.lag", "solid_iron"
+    kind: str  # "fixed", "gain", "lag", "cross-talk", "eddy" (f = k_i i/(1 + s/a)), "iron" (k_i i/(1 + (s/a)^0.5))
     errors: tuple[SensorError, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Score:
     """A cause, how sure it is in standard deviations, and what it would have to be."""
 
     cause: Cause
     z: float
-    size: float  # change of the number, relative gain, lag in s, share, time constant in s
+    size: float  # change of the number, relative gain, lag in s, share, time constant in s, its root
     gain: float  # by how much it would lower the sum of squares
+    shift: Array = field(default_factory=lambda: np.zeros(0))  # by how much it has moved the vector
+    spread: Array = field(default_factory=lambda: np.zeros(0))  # standard deviations of that
 
 
 def causes_of(unknowns: Unknowns) -> tuple[Cause, ...]:
@@ -72,7 +76,8 @@ def causes_of(unknowns: Unknowns) -> tuple[Cause, ...]:
     for of, group in groupby(lags, lambda e: e.channel.split("_")[1].rstrip("0123456789")):
         if len(all_of := tuple(group)) > 1 and of in _TOGETHER:
             causes.append(Cause(name=f"{_TOGETHER[of]}.lag", kind="lag", errors=all_of))
-    return (*causes, *(() if "a" in model.extras else (Cause(name="eddy_pole", kind="eddy"),)))
+    eddy = () if "a" in model.extras else (Cause(name="eddy_pole", kind="eddy"),)
+    return (*causes, *eddy, Cause(name="solid_iron", kind="iron"))
 
 
 def scores(problem: Likelihood, v: Array) -> list[Score]:
@@ -85,16 +90,19 @@ def scores(problem: Likelihood, v: Array) -> list[Score]:
 
 def scored(causes: Sequence[Cause], C: Array, J: Array, r: Array, n: int) -> list[Score]:
     """Return scores by what each cause adds, C (n_rows, n_causes), slopes J and residuals r; `n`: real residuals."""
-    inverse = directions(triangle_of([J])).inverse(1e-9)
-    outside = C - J @ (inverse @ (J.T @ C))
+    rows = triangle_of([np.column_stack([J, C, r])])
+    J, C, r = rows[:, : J.shape[1]], rows[:, J.shape[1] : -1], rows[:, -1]
+    moved = directions(J).solve(C)
+    outside = C - J @ moved
     own, whole = np.sum(outside**2, axis=0), np.sum(C**2, axis=0)
     along = outside.T @ r
     spread = np.sqrt(max(1.0, float(r @ r) / n))
     found = [
-        Score(cause=c, z=float(a / np.sqrt(o) / spread), size=float(a / o), gain=float(a * a / o))
-        for c, a, o, w in zip(causes, along, own, whole, strict=True)
+        Score(cause=c, z=float(a / np.sqrt(o) / spread), size=float(a / o), gain=float(a * a / o), shift=a / o * m,
+              spread=spread / np.sqrt(o) * m)
+        for c, a, o, w, m in zip(causes, along, own, whole, moved.T, strict=True)
         if o > _OWN * w and o > 0.0
-    ]
+    ]  # fmt: skip
     return sorted(found, key=lambda s: -abs(s.z))
 
 
@@ -105,8 +113,8 @@ def _by_cause(problem: Likelihood, v: Array, causes: Sequence[Cause], *, correct
     blocks = []
     for e, w in zip(problem.experiments, problem.weights, strict=True):
         moved = _columns(e, w if corrected else replace(w, back=None), model, at, errors)
-        single = dict(zip([*errors, None], moved, strict=False))  # no eddy pole where it is in the model
-        columns = [np.sum([single[x] for x in c.errors or (None,)], axis=0) for c in causes]
+        single = dict(zip([*errors, "eddy", "iron"], moved, strict=True))
+        columns = [np.sum([single[x] for x in c.errors or (c.kind,)], axis=0) for c in causes]
         block = (w.whiten @ np.stack(columns, axis=2)).reshape(-1, len(causes))
         blocks.append(np.sqrt(2.0) * np.concatenate([block.real, block.imag]))
     return blocks
@@ -123,7 +131,7 @@ def refined(problem: Likelihood, v: Array, found: Sequence[Score]) -> list[Score
     twins = [b for a, b in _TWINS if best.cause.name.endswith(a)]
     top = [s for s in found if s.gain > _WORTH * best.gain or s.cause.name.endswith(tuple(twins))][:_MOST]
     searched = [_searched(problem, v, s, before) for s in top]
-    possible = [s for s in searched if s.cause.kind not in ("lag", "eddy") or s.size > 0.0]
+    possible = [s for s in searched if s.cause.kind not in _LATE or s.size > 0.0]
     return sorted(possible, key=lambda s: -s.gain) or list(found)
 
 
@@ -147,7 +155,7 @@ class _Beside:
 
     def freed(self, theta: Array) -> Likelihood:
         """Return the problem without the cause."""
-        return _without(self.problem, self.cause, self.unit * float(theta[-1]))
+        return _without(self.problem, theta[:-1], self.cause, self.unit * float(theta[-1]))
 
     def cost(self, theta: Array) -> float:
         """Return the criterion."""
@@ -165,18 +173,17 @@ class _Beside:
 
 def _searched(problem: Likelihood, v: Array, s: Score, before: float) -> Score:
     """Return a score whose size is searched together with the parameters, from zero, and a lag from what turns the
-    highest line: a fit that lacks it stands far away. An eddy pole keeps the score of its first order.
+    highest line: a fit that lacks it stands far away.
     """
-    if s.cause.kind == "eddy":
-        return s
-    lag = s.cause.kind == "lag"
-    unit = 1.0 / max(float(e.spectra.omega[-1]) for e in problem.experiments) if lag else abs(s.size)
+    lag, last = s.cause.kind in _LATE, max(float(e.spectra.omega[-1]) for e in problem.experiments)
+    unit = abs(s.size) if not lag else last**-0.5 if s.cause.kind == "iron" else 1.0 / last
     beside = _Beside(problem=problem, cause=s.cause, unit=unit)
     starts = [np.append(v, x) for x in ((0.0, 1.0) if lag else (0.0,))]
     ends = [search(beside, x, most=_STEPS, tolerance=1e-4, longest=1.0) for x in starts]
     best = min(ends, key=lambda x: x.cost)
     size, gain = unit * float(best.theta[-1]), max(before - best.cost, 0.0)
-    return Score(cause=s.cause, z=float(np.sign(size) * np.sqrt(gain * s.z**2 / s.gain)), size=size, gain=gain)
+    z = float(np.sign(size) * np.sqrt(gain * s.z**2 / s.gain))
+    return replace(s, z=z, size=size, gain=gain, shift=v - best.theta[:-1])
 
 
 def sensor_gain(problem: Likelihood, v: Array) -> float:
@@ -187,8 +194,8 @@ def sensor_gain(problem: Likelihood, v: Array) -> float:
 def _columns(
     e: Experiment, w: Weight, model: RotorModel, at: Point, errors: Sequence[SensorError]
 ) -> Iterator[Complex]:
-    """Yield what each error adds to the outputs, (n_lines, n_y); an eddy pole last, where it is not in the model. The
-    inputs are those of the slopes: freed of what feedback put in.
+    """Yield what each error adds to the outputs, (n_lines, n_y), last an eddy pole and solid iron. The inputs are those
+    of the slopes: freed of what feedback put in.
     """
     of, turned = sampled(e, model, at), model.at_speed(e.speed)
     H, mean = of.transfer(), e.spectra.mean_u
@@ -210,25 +217,43 @@ def _columns(
         other = y[:, outputs.index(error.other)] if error.other else None
         added[:, k] = logged_error(error.kind, y[:, k], omega, other)
         yield added
-    if "a" not in model.extras:
-        rate = np.zeros((y.shape[0], len(model.axes)), dtype=complex)
-        for j, axis in enumerate(model.axes):
-            role = f"{axis}_current"
-            current = y[:, outputs.index(role)] if role in outputs else mean[:, j]
-            rate[:, j] = logged_error("lag", at.theta[f"{axis}.k_i"] * current, omega)
-        yield (of.disturbed()[:, :, : len(model.axes)] @ rate[:, :, None])[:, :, 0]
+    forced = _forced(of, model, at, mean, y)
+    yield -1j * omega[:, None] * forced
+    yield -np.sqrt(1j * omega)[:, None] * forced
 
 
-def _without(problem: Likelihood, cause: Cause, size: float) -> Likelihood:
-    """Return the problem freed of a cause of a size."""
-    if cause.kind == "eddy":
-        return problem
-    base, experiments = problem.base, problem.experiments
+def _forced(of: Sampled, model: RotorModel, at: Point, U: Complex, Y: Complex) -> Complex:
+    """Return what the forces of the currents do to the outputs, (..., n_lines, n_y), by inputs and outputs."""
+    omega, theta = of.omega, at.theta
+    course = np.exp(0.5j * omega / of.rate_hz) / np.sinc(omega / of.rate_hz / (2.0 * np.pi))  # of what is not held
+    if "a" in model.extras:
+        course = course / (1.0 + 1j * omega / theta["a"])
+    signals = dict(zip((*model.inputs, *model.outputs), (*np.moveaxis(U, -1, 0), *np.moveaxis(Y, -1, 0)), strict=True))
+    forced, D = np.zeros(Y.shape, dtype=complex), of.disturbed()
+    for k, axis in enumerate(model.axes):
+        if k in model.amplified:
+            amplifier = theta[f"{axis}.amplifier_gain"] / (1.0 + 1j * omega / theta[f"{axis}.amplifier_pole"])
+            current = signals[f"{axis}_command"] * amplifier
+        else:
+            current = signals[f"{axis}_current"]
+        forced += (theta[f"{axis}.k_i"] * course * current)[..., None] * D[:, :, k]
+    return forced
+
+
+def _without(problem: Likelihood, v: Array, cause: Cause, size: float) -> Likelihood:
+    """Return the problem freed of a cause of a size, at a vector."""
+    base, experiments, model, at = problem.base, problem.experiments, problem.unknowns.model, problem.point(v)
+    if not cause.errors:
+        power = 1.0 if cause.kind == "eddy" else 0.5
+        lost = [1.0 / (1.0 + size * (1j * e.spectra.omega) ** power) - 1.0 for e in experiments]
+        of = [(e.spectra, sampled(e, model, at)) for e in experiments]
+        Y = [q.Y - x[:, None] * _forced(there, model, at, q.U, q.Y) for (q, there), x in zip(of, lost, strict=True)]
+        experiments = [replace(e, spectra=replace(e.spectra, Y=y)) for e, y in zip(experiments, Y, strict=True)]
     for error in cause.errors:
         if error.kind == "fixed":
             base = replace(base, theta={**base.theta, error.channel: base.theta[error.channel] + size})
         else:
-            experiments = [replace(e, spectra=_freed(e.spectra, problem.unknowns.model, error, size))
+            experiments = [replace(e, spectra=_freed(e.spectra, model, error, size))
                            for e in experiments]  # fmt: skip
     return replace(problem, base=base, experiments=experiments)
 
@@ -252,9 +277,8 @@ def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Che
     """
     if not found:
         return {}
-    best = found[0]
-    units = {p.name: p.unit for p in model.parameters}
-    alike = [s for s in found[1:] if s.gain > min(_ALIKE * best.gain, best.gain - _CLOSE)]
+    best, units = found[0], {p.name: p.unit for p in model.parameters}
+    alike = _alike(found)
     others = [s.cause.name for s in alike] + ["planes"] * ("+" in best.cause.name)
     twin = next((best.cause.name.replace(a, b) for a, b in _TWINS if best.cause.name.endswith(a)), "")
     twins = _late_instead(best.cause.name) if _leads(best) else (twin,)
@@ -284,15 +308,26 @@ def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Che
     return checks
 
 
+def _alike(found: Sequence[Score]) -> list[Score]:
+    """Return the scores that explain the residuals about as well as the first."""
+    best = found[0].gain
+    return [s for s in found[1:] if s.gain > min(_ALIKE * best, best - _CLOSE)]
+
+
+def suspects(found: Sequence[Score]) -> list[Score]:
+    """Return the score that a check fails for, and those about as good; none where the checks pass."""
+    return [found[0], *_alike(found)] if found and abs(found[0].z) >= _FAR else []
+
+
 def _leads(s: Score) -> bool:
     """Whether a score would have a channel lead, as none does: others lag."""
-    return s.cause.kind in ("lag", "eddy") and s.size < 0.0
+    return s.cause.kind in _LATE and s.size < 0.0
 
 
 def _late_instead(name: str) -> tuple[str, ...]:
     """Return the lags of current and voltage that a lead of another channel stands for."""
     axis, _, channel = name.partition("_")
-    if not channel or name == "eddy_pole":
+    if not channel or name in ("eddy_pole", "solid_iron"):
         return ("currents.lag", "voltages.lag")
     return (f"{axis}_current.lag", f"{axis}_voltage.lag")
 
@@ -311,7 +346,8 @@ def _shown(s: Score, units: dict[str, str]) -> str:
     if kind == "fixed":
         size = f"{1e3 * s.size:+.3g} mm" if unit == "m" else f"{s.size:+.3g} {unit}"
     else:
-        size = f"{1e6 * s.size:.3g} us" if kind in ("lag", "eddy") else f"{100 * s.size:+.3g} %"
+        late = f"{s.size**-2 / (2.0 * np.pi):.3g} Hz" if kind == "iron" else f"{1e6 * s.size:.3g} us"
+        size = late if kind in _LATE else f"{100 * s.size:+.3g} %"
     return f"{s.cause.name} ({size})"
 
 
@@ -323,14 +359,21 @@ def _words(s: Score, unit: str) -> str:
         both = " and ".join(name.split("+"))
         return f"the record contradicts {both}: {shown} would fit better ({sure}). Measure it, or let it be free"
     if _leads(s):
+        lead = "" if kind == "iron" else f" of {1e6 * abs(s.size):.3g} us"
         return (
-            f"{name} would have to be a lead of {1e6 * abs(s.size):.3g} us ({sure}), as no sensor has: currents or "
+            f"{name} would have to be a lead{lead} ({sure}), as no sensor has: currents or "
             "voltages lag behind what is logged, or are logged late. Log them without filters"
         )
     if kind == "eddy":
         return (
             f"the positions lag behind the currents by {1e6 * s.size:.3g} us ({sure}). Add to [parameters] an eddy "
             "pole, a, or the poles of the sensors"
+        )
+    if kind == "iron":
+        return (
+            f"the forces follow the currents as 1/(1 + (s/a)^0.5), a of about {s.size**-2 / (2.0 * np.pi):.3g} Hz "
+            f"({sure}), as eddy currents in solid iron do: the intervals hold that. Excite more slowly, or let the "
+            "iron be laminated"
         )
     if kind == "cross-talk":
         return (
@@ -384,7 +427,7 @@ def curvature(problem: Likelihood, v: Array) -> Bent | None:
     C = np.concatenate([_bent(problem, e, w, at) for e, w in pairs])
     C /= np.linalg.norm(C, axis=0)
     J, r = rows[:, :-1], rows[:, -1]
-    moved = directions(triangle_of([J])).inverse(1e-9) @ (J.T @ C)
+    moved = directions(J).solve(C)
     outside = C - J @ moved
     values, axes = np.linalg.eigh(outside.T @ outside)
     axes, values = axes[:, values > _OWN], values[values > _OWN]
