@@ -125,6 +125,20 @@ def filtered(record: Record, role: str, hertz: float) -> Record:
     return changed(record, **{role: lambda x: lfilter([1.0 - late], [1.0, -late], x, zi=[late * x[0]])[0]})
 
 
+def test_a_lag_of_a_coil_is_named_without_whole_periods(sound: Any) -> None:
+    late = filtered(sound[0][0.0:0.45], "ax_current", 3000.0)
+    assert set(named(late, sound[1], "sensors_agree")) == {"ax_current.lag", "ax_voltage.lag"}
+
+
+def test_hum_is_named_without_whole_periods(sound: Any) -> None:
+    record, rig = sound[0][0.0:0.45], sound[1]
+    hum = 0.02 * np.sin(2.0 * np.pi * 50.0 * np.arange(record.n_samples) / record.rate_hz)
+    check = ambid.identify(changed(record, bx_current=lambda x: x + hum), rig).checks["lines"]
+    assert (check.passed, check.cause, check.alternatives) == (False, "line", ("mode",))
+    assert check.size == pytest.approx(50.0, abs=1.2)
+    assert "most in bx_current" in check.detail
+
+
 @pytest.mark.parametrize("logs_a", [False, True])
 def test_solid_iron_is_named_and_within_the_intervals(monkeypatch: Any, logs_a: bool) -> None:
     bench = replace(truth.BENCHES["rigid"], period=0.25)

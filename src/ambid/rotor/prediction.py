@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.likelihood import Fit, extend, score_statistic, search
+from ambid.estimation.likelihood import (
+    Fit,
+    innovations,
+    prior_rows,
+    residual_blocks,
+    score_statistic,
+    search,
+    weight_of,
+    workspace_near,
+)
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
@@ -128,10 +137,10 @@ class _Erring(Searched):
             if error.kind == "fixed":
                 d = self.rotor.derivative(at, error.channel)
                 moved = StateSpace(A=moved.A + d.A, B=moved.B + d.B, E=moved.E + d.E, C=moved.C + d.C)
-            elif error.channel in self.inputs:
+            elif error.channel in self.inputs and error.kind == "gain":
                 k = self.inputs.index(error.channel)
                 moved.B[:, k] -= space.B[:, k]
-            else:
+            elif error.kind != "lag" or error.channel.endswith("_position"):  # see `_late_columns`
                 k = self.outputs.index(error.channel)
                 row = {"gain": space.C[k], "lag": -space.C[k] @ space.A}
                 moved.C[k] += row[error.kind] if error.kind in row else space.C[self.outputs.index(error.other)]
@@ -139,14 +148,10 @@ class _Erring(Searched):
 
 
 def predictor_scores(found: PredictorFit) -> list[Score]:
-    """Return the causes that the innovations may have: fixed numbers, gains, cross-talk, lags of positions."""
+    """Return the causes that the innovations may have: fixed numbers, gains, cross-talk, lags."""
     fit, searched = found.fit, found.fit.problem.model
     assert isinstance(searched, Searched)
-    unseen = ("_current", "_voltage", "_command")  # lags of these move no matrix of the plant
-    causes = {
-        c.name: c for c in causes_of(searched.unknowns)
-        if c.errors and not any(e.kind == "lag" and e.channel.endswith(unseen) for e in c.errors)
-    }  # fmt: skip
+    causes = {c.name: c for c in causes_of(searched.unknowns) if c.errors}
     old, n, more = fit.problem, fit.problem.n_physical, len(causes)
     erring = _Erring(unknowns=searched.unknowns, base=searched.base, causes=causes)
     problem = replace(
@@ -154,13 +159,49 @@ def predictor_scores(found: PredictorFit) -> list[Score]:
         prior_mean=np.append(old.prior_mean, np.zeros(more)), prior_sd=np.append(old.prior_sd, np.full(more, np.inf)),
         joint_priors=None,
     )  # fmt: skip
-    rows = extend(fit, problem, np.insert(fit.vector, n, np.zeros(more)))
-    if rows is None:
+    weight, vector = weight_of(fit.covariance), np.insert(fit.vector, n, np.zeros(more))
+    late, first, parts = _late_columns(fit, tuple(causes.values())), 0, list[Array]()
+    for block in residual_blocks(problem, vector, weight, workspace_near(fit, problem)):
+        rows = block.copy()
+        rows[:, :, n : n + more] += np.einsum("ij,tjk->tik", weight, late[first : first + len(rows)])
+        parts.append(triangle_of([rows.reshape(-1, problem.size + 1)]))
+        first += len(rows)
+    if not parts:
         return []
+    r, J = prior_rows(problem, vector)
+    rows = triangle_of([*parts, np.column_stack([J, r])])
     of_noise = np.zeros(problem.size, dtype=np.bool_)
     of_noise[problem.slices["noise"]] = True  # levels take up a part of what is left out
     of_noise[n : n + more] = True
-    return scored(tuple(causes.values()), rows[0][:, n : n + more], rows[0][:, ~of_noise], -rows[1], old.y.size)
+    C, J, r = rows[:, n : n + more], rows[:, :-1][:, ~of_noise], rows[:, -1]
+    return scored(tuple(causes.values()), C, J, -r, old.y.size)
+
+
+def _late_columns(fit: Fit, causes: Sequence[Cause]) -> Array:
+    """Return what lags of coils' channels, which move no matrix of the plant, do to the innovations, (n_used, n_y,
+    n_causes): an input moves by its own last step, an output by that from its last value to what is predicted.
+    """
+    problem, plant = fit.problem, fit.problem.model
+    e = innovations(problem, fit.vector)
+    assert e is not None
+    used = slice(problem.skip, None)
+    predicted, columns = problem.y[used] - e * problem.scales.output, np.zeros((*e.shape, len(causes)))
+    of = dict[str, Array]()
+    for k, cause in enumerate(causes):
+        for error in (x for x in cause.errors if x.kind == "lag" and not x.channel.endswith("_position")):
+            if error.channel not in of:
+                u, y = problem.u.copy(), problem.y.copy()
+                if error.channel in plant.inputs:
+                    j = plant.inputs.index(error.channel)
+                    u[1:, j] -= np.diff(problem.u[:, j])
+                else:
+                    j = plant.outputs.index(error.channel)
+                    y[used, j] += predicted[:, j] - problem.y[problem.skip - 1 : -1, j]
+                moved = innovations(replace(problem, u=u, y=y), fit.vector)
+                assert moved is not None
+                of[error.channel] = problem.rate_hz * (moved - e)
+            columns[:, :, k] += of[error.channel]
+    return columns
 
 
 def predict_rotor(

@@ -11,18 +11,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.bearing.sizes import check_units
 from ambid.bearing.uncertainty import noise_levels
 from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.likelihood import innovations
 from ambid.estimation.predictor import assemble
+from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
-from ambid.rotor.conclusion import Evidence
+from ambid.rotor.conclusion import Evidence, shifts_of
 from ambid.rotor.prediction import PredictorFit, predictor_scores
-from ambid.rotor.scores import agreement_checks
+from ambid.rotor.scores import agreement_checks, suspects
 from ambid.validation.physical import innovation_products, innovation_tests
 from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
 
@@ -37,7 +39,7 @@ def of_predictor(found: PredictorFit) -> Evidence:
     disturbance, sensor = noise_levels(fit, predictor)
     e = e * problem.scales.output
     share, size = fit_of(e, problem.y[problem.skip :]), np.sqrt(np.mean(e**2, axis=0))
-    agree = _asked(agreement_checks(predictor_scores(found), found.model))
+    causes = predictor_scores(found)
     checks = {"residuals_white": white_check(white), "residuals_uncorrelated": uncorrelated_check(past)}
     return Evidence(
         method="predictor",
@@ -46,7 +48,12 @@ def of_predictor(found: PredictorFit) -> Evidence:
             role: OutputFit(one_step=float(a), simulation=None, innovation_sd=float(b))
             for role, a, b in zip(found.model.outputs, share, size, strict=True)
         },
-        checks={**checks, **_or_late(agree, all(c.passed for c in checks.values()))},
+        shifts=shifts_of(found, causes),
+        checks={
+            **checks,
+            **_asked(agreement_checks(causes, found.model)),
+            **({} if suspects(causes) else _line_check(e, found.model, problem.rate_hz)),
+        },
     )
 
 
@@ -55,23 +62,32 @@ def _asked(checks: dict[str, Check]) -> dict[str, Check]:
     fine = checks.get("sensors_agree")
     if fine is None or not fine.passed:
         return checks
-    text = (
-        "no gain or cross-talk of a channel and no lag of a position shows in the innovations, which lags of currents "
-        "and voltages and eddy poles were not asked of"
-    )
+    text = "no gain, lag or cross-talk of a channel shows in the innovations, which were not asked of eddy currents"
     return {**checks, "sensors_agree": replace(fine, detail=text)}
 
 
-def _or_late(checks: dict[str, Check], white: bool) -> dict[str, Check]:
-    """Return checks that name the lags of a coil's current and voltage, which innovations are not tested for, beside
-    their gains where the innovations are not white; a position that leads names them by itself.
-    """
-    named = checks.get("sensors_agree")
-    if white or named is None or not named.cause.endswith(("_current.gain", "_voltage.gain")):
-        return checks
-    lags = tuple(f"{named.cause.split('_')[0]}_{x}.lag" for x in ("current", "voltage"))
-    text = f"{named.detail}; or by {' or '.join(lags)}"
-    return {**checks, "sensors_agree": replace(named, detail=text, alternatives=(*named.alternatives, *lags))}
+_CHANCE = 1e-6  # probability below which a line counts as seen
+_NEAR, _NARROW = 12, 0.8  # frequencies on either side, and what part of their power is of a line
+
+
+def _line_check(e: Array, plant: RotorModel, rate_hz: float) -> dict[str, Check]:
+    """Name the line of which innovations hold most, if there is one: power at a single frequency, over the median."""
+    n, n_y = e.shape
+    power = np.abs(np.fft.rfft(e * np.hanning(n)[:, None], axis=0)[3 : n // 2]) ** 2
+    power /= np.median(power, axis=0) / np.log(2.0)  # of an exponential
+    whole = power.sum(axis=1)
+    j = int(np.argmax(whole))
+    over = whole[max(j - _NEAR, 0) : j + _NEAR + 1] - n_y
+    narrow = float(np.sum(whole[max(j - 1, 0) : j + 2] - n_y)) > _NARROW * float(over.sum())
+    if not narrow or whole.size * chi_squared_tail(2 * n_y, 2.0 * float(whole[j])) > _CHANCE:
+        return {}
+    frequency, channel = (j + 3) * rate_hz / n, plant.outputs[int(np.argmax(power[j]))]
+    check = Check(
+        passed=False, cause="line", size=frequency, alternatives=("mode",),
+        detail=f"a line at {frequency:.4g} Hz stands in the innovations, most in {channel}: hum, motion of the base, a "
+        "tone, or a bending mode that the model lacks. Look for it with the excitation off",
+    )  # fmt: skip
+    return {"lines": check}
 
 
 _LONGEST = 30.0  # m between planes: shafts of turbine sets
