@@ -227,6 +227,17 @@ def test_hum_is_named_and_taken_out(sound: Any, frequency: float) -> None:
     assert not [p.name for p in plain.parameters if abs(found[p.name].value - p.value) > p.sd]
 
 
+def test_two_tones_close_together_are_named_and_taken_out(sound: Any) -> None:
+    record, rig = sound
+    t = np.arange(record.n_samples) / record.rate_hz
+    hum = 0.01 * sum(np.sin(2.0 * np.pi * f * t + 0.3) for f in (50.0, 55.3))
+    found = ambid.identify(changed(record, ax_current=lambda x: x + hum), rig)
+    assert found.verdict.word == "usable", found.verdict.reasons
+    said = next(w for w in found.warnings if "lines were taken out" in w).split("taken out: ")[1].split(". ")[0]
+    frequencies = [float(line.removesuffix(" Hz in ax_current")) for line in said.split(", ")]
+    assert sorted(frequencies) == pytest.approx([50.0, 55.3], abs=0.1)
+
+
 def test_a_sound_record_has_no_line(sound: Any) -> None:
     assert not [w for w in ambid.identify(*sound).warnings if "lines" in w]
 

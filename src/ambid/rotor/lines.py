@@ -21,6 +21,7 @@ from ambid.rotor.synchronous import aperiodic
 _STANDS_OUT, _FOUND = 8.0, 12.0  # times the median of the lines around, to be taken out, and to be found
 _AROUND, _NEAR = 20, 12  # lines on either side for that median, and of which it must hold nearly all power
 _NARROW = 0.8
+_BESIDES, _SHARP = 2, 0.1  # other lines among those, and what part of their power at most is three lines away
 _LIKE, _ALONE = 8, 30.0  # excited lines on either side, over the largest of which one of them has to stand
 _APART = 3  # lines that two are apart
 _OF_ONE = 0.7  # part of a line's power from which it is of one channel
@@ -62,7 +63,8 @@ def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
         around = power[max(0, j - _AROUND) : j + _AROUND + 1]
         if power[j] < _FOUND * float(np.median(around)):
             break
-        over = power - float(np.median(around))
+        level = float(np.median(around))
+        over = power - level
         if excited[j]:  # what the model lacks shows at several lines
             k = int(np.searchsorted(at_lines, j))
             others = np.delete(at_lines[max(0, k - _LIKE) : k + _LIKE + 1], min(k, _LIKE))
@@ -70,7 +72,9 @@ def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
                 continue
         if any(abs(j - other) < _APART for other in found):
             continue
-        if float(over[max(0, j - 2) : j + 3].sum()) > _NARROW * float(over[max(0, j - _NEAR) : j + _NEAR + 1].sum()):
+        near = slice(max(0, j - _NEAR), j + _NEAR + 1)
+        besides = _sharp(power[near], j - near.start, _FOUND * level)
+        if float(over[max(0, j - 2) : j + 3].sum()) > _NARROW * float(over[near][~besides].sum()):
             shares = np.abs(np.sum(ways[j].conj() * w[j][:, None], axis=0)) ** 2
             shares /= np.maximum(np.sum(np.abs(ways[j]) ** 2, axis=0), 1e-300)
             k, names = int(np.argmax(shares)), (*fit.model.outputs, *fit.model.disturbances)
@@ -78,6 +82,22 @@ def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
             channel = names[k] if one else "several channels"
             found[j] = Line(frequency_hz=float(frequency[j]), channel=channel, excited=bool(excited[j]))
     return list(found.values())
+
+
+def _sharp(power: Array, own: int, least: float) -> NDArray[np.bool_]:
+    """Return where the largest other lines beside the line `own` stand, which are as sharp as one."""
+    beside: NDArray[np.bool_] = np.zeros(power.size, dtype=np.bool_)
+    of_own = slice(max(0, own - 2), own + 3)
+    for _ in range(_BESIDES):
+        left = np.where(beside, 0.0, power)
+        left[of_own] = 0.0
+        k = int(np.argmax(left))
+        sides = power[[x for x in (k - 3, k + 3) if 0 <= x < power.size and abs(x - own) > 2]]
+        if left[k] < least or np.any(sides > _SHARP * left[k]):
+            break
+        beside[max(0, k - 2) : k + 3] = True
+    beside[of_own] = False
+    return beside
 
 
 def _whitened(
