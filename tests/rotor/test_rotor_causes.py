@@ -15,6 +15,10 @@ from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.record import Record
 from ambid.rig import Rig, rig_of_preset
+from ambid.rig.rotor import RigModes
+from ambid.rotor.conclusion import shifts_of
+from ambid.rotor.estimator import estimate_rotor
+from ambid.rotor.likelihood import Experiment
 from ambid.rotor.lines import Line, apart
 from ambid.rotor.scores import Cause, Score, agreement_checks, scored
 from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
@@ -164,6 +168,21 @@ def iron(A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
         own = slice(4 * k, 4 * k + 4)
         big[own, own], big[own, 52:56], big[44:52, own] = -pole * np.eye(4), pole * np.eye(4), part * force
     return big, into, np.hstack([np.zeros((8, 44)), C])
+
+
+def test_a_shift_beyond_first_order_stays_finite(sound: Any) -> None:
+    record, model = sound[0], sound[1].rotor
+    excitation = find_excitation(record, model)
+    assert excitation is not None
+    experiment = Experiment(spectra=period_spectra(record, model, excitation), speed=0.0)
+    known = sound[1].parameters
+    fit = estimate_rotor([experiment], model, known, delays=[1.0] * 4, modes=RigModes(count=0))
+    n, cause = fit.vector.size, Cause(name="currents.lag", kind="lag")
+    far = Score(cause=cause, z=9.0, size=1.0, gain=81.0, shift=np.full(n, -1e3), spread=np.zeros(n))
+    shift, _ = shifts_of(fit, [far])
+    names, _ = fit.unknowns.chain(fit.vector)
+    assert np.all(np.isfinite(shift))
+    assert shift[names.index("m")] == pytest.approx((1.0 - np.exp(3.0)) * fit.point.theta["m"])
 
 
 def test_a_score_does_not_depend_on_slopes_that_are_nearly_alike() -> None:

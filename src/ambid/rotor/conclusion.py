@@ -25,6 +25,7 @@ _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
 _LIMIT_SHARE = 0.05  # of the mean square, above which they matter
 _LENGTH_SEEN = 0.25
+_FOLD = 3.0  # logarithm of a number by which a cause may move it: beyond, it is not identifiable in any case
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,7 +110,9 @@ def shifts_of(fit: Ending, found: Sequence[Score]) -> list[Array]:
     names, chain = fit.unknowns.chain(fit.vector)
     free, n, shifts = list(fit.unknowns.free_delays), fit.vector.size, list[Array]()
     for s in suspects(found):
-        points = (fit.point, replace(fit, vector=fit.vector - s.shift[:n]).point)
+        shift, logs = s.shift[:n].copy(), slice(len(fit.unknowns.logs))
+        shift[logs] = np.clip(shift[logs], -_FOLD, _FOLD)
+        points = (fit.point, replace(fit, vector=fit.vector - shift).point)
         is_now, would_be = (np.array([*(p.theta[x] for x in names), *p.delays[free]]) for p in points)
         spread = chain[[*range(len(names)), *(len(names) + k for k in free)]] @ s.spread[:n]
         shifts += [is_now - would_be, spread]
