@@ -170,6 +170,7 @@ def record_of(module: Any, name: str, case: Case, seed: int) -> tuple[Any, Any, 
     )
     truth = {"m": modal.mass[0], "Id": modal.mass[1], "z_cg": DATUM}
     truth |= {f"{a}.{q}": getattr(bench, q)[j] for q in ("k_i", "k_x", "R", "L") for j, a in enumerate(AXES)}
+    truth |= {f"{a}.amplifier_pole": bench.R[j] / bench.L[j] for j, a in enumerate(AXES)}
     truth |= {f"mode{r}": w / TURN for r, w in enumerate(modal.omega[2:], 1)}
     return record, rig_from_text(_rig(case, bench, modal, inputs, truth), "rig.toml"), truth
 
