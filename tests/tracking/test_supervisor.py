@@ -251,6 +251,21 @@ def test_accept_publishes_the_working_estimate_at_once_and_revert_goes_back_and_
     assert [e.kind for e in run.of("accepted", "reverted")] == ["accepted", "reverted"]
 
 
+def test_revert_undoes_the_last_accept_and_lines_say_before_what_it_would_do(jump):
+    """Values that were accepted by themselves since do not come between; what lines promise comes to be."""
+    run = tracked(jump, flags=((1.2, "accept"), (1.48, "revert")))
+    before, last, back = run.at(1.2), run.at(1.48), run.at(1.49)
+    assert run.lines[-1].parameters["k_i"].value != run.at(1.21).parameters["k_i"].value
+    for name, v in before.parameters.items():
+        assert back.parameters[name].value == last.choices["revert"].parameters[name].value == v.value
+    searched = run.at(1.53)
+    assert "accept" not in searched.choices
+    held = tracked(jump, flags=((1.2, "hold"), (1.3, "accept")))
+    promised, there = held.at(1.3).choices["accept"], held.at(1.32)
+    assert there.parameters["k_i"].value == pytest.approx(promised.parameters["k_i"].value, rel=1e-3)
+    assert held.lines[0].choices.keys() <= {"accept"}
+
+
 def test_there_is_nothing_to_accept_while_a_change_is_searched(jump):
     run = tracked(jump, flags=((1.52, "accept"),))
     (refused,) = [e for e in run.of("refused") if "nothing to accept" in e.why]

@@ -91,6 +91,14 @@ class TrackHeader:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """What an order of an operator would put in force."""
+
+    t: float  # when these values were accepted, or formed, s of record
+    parameters: Mapping[str, TrackedValue]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrackLine:
     """One reporting interval.
 
@@ -107,6 +115,9 @@ class TrackLine:
         In the order in which they happened; the most important first.
     extra : Mapping[str, TrackedValue]
         Tracked numbers beside the parameters, such as unbalance amplitude and phase.
+    choices : Mapping[str, Choice]
+        What ``accept`` and ``revert`` of an operator would put in force; one that would be refused is not there. Not
+        written to files.
     """
 
     t: float
@@ -115,6 +126,7 @@ class TrackLine:
     state: State
     events: tuple[Event, ...] = ()
     extra: Mapping[str, TrackedValue] = field(default_factory=lambda: MappingProxyType({}))
+    choices: Mapping[str, Choice] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

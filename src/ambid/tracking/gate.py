@@ -195,15 +195,15 @@ class Gate:
             self._candidate, t, f"{self._candidate.why}: accepted without validation, by operator order", None
         )
 
-    def revert(self, t: float | None = None, why: str = "by order") -> Event:
-        """Go back to the numbers accepted before, dropping a candidate; `t`: s of record, default when the present ones
-        were accepted. Returns ``reverted``, or ``refused`` if there are no earlier ones.
+    def revert(self, t: float | None = None, why: str = "by order", goal: Accepted | None = None) -> Event:
+        """Go back to numbers in force before, `goal` or the ones accepted last, dropping a candidate; `t`: s of record,
+        default when the present ones were accepted. Returns ``reverted``, or ``refused`` if there are no earlier ones.
         """
         left = self.accepted
         t = left.t if t is None else t
-        if len(self._history) < 2:
+        if goal is None and len(self._history) < 2:
             return Event(kind="refused", t=t, why="there are no earlier values to return to")
-        return self._return(self._history[-2], t, why)
+        return self._return(self._history[-2] if goal is None else goal, t, why)
 
     def _return(self, goal: Accepted, t: float, why: str) -> Event:
         """Put earlier numbers in force again."""
@@ -449,6 +449,7 @@ class Publication:
         self._own = numbers.places("parameter", "gain")
         self.unconfirmed, self.updates = False, 0
         self._held = False
+        self._undo: list[Accepted] = []  # what was in force before each accept of the operator
 
     @property
     def accepted(self) -> Accepted:
@@ -500,6 +501,23 @@ class Publication:
         self.unconfirmed = False
         return True
 
+    def goals(self, t: float, *, searching: bool) -> dict[Order, Accepted]:
+        """Return what each order would put in force at `t`, s of record; one that would be refused is left out."""
+        goals = dict[Order, Accepted]()
+        if not searching:
+            now = self._rpem.filter
+            goals["accept"] = Accepted(values=now.q, covariance=now.covariance, t=t, why="the present estimate")
+        undone = self._undone()
+        if undone is not None or len(self.gate.history) > 1:
+            goals["revert"] = self.gate.history[-2] if undone is None else undone
+        return goals
+
+    def _undone(self) -> Accepted | None:
+        """Return what was in force before the last accept of the operator that still is to be undone."""
+        while self._undo and self._undo[-1] is self.accepted:
+            self._undo.pop()
+        return self._undo[-1] if self._undo else None
+
     def obey(self, t: float, *, searching: bool) -> bool:
         """Carry out the operator's orders at `t` (s of record); `searching`: the working estimate is that from before a
         change. Returns whether something else is published now.
@@ -514,10 +532,11 @@ class Publication:
         elif order == "accept":
             self.gate.restart()
             self.propose(t, "the present estimate")
+            self._undo.append(before)
             self._log.add(self.gate.accept(t))
             self.unconfirmed = False
         else:
-            self._log.add(self.gate.revert(t, "by order of the operator"))
+            self._log.add(self.gate.revert(t, "by order of the operator", self._undone()))
             self._log.add(self._operator.set("hold", t, "after going back, until the operator sets track"))
         changed = self.accepted is not before
         self.updates += changed

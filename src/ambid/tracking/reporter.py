@@ -131,6 +131,7 @@ class Reporter:
             state=s.state,
             events=events,
             extra=s.extra,
+            choices=s.choices,
         )
         self._pass_interval()
         self.lines += 1

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.recursive.lines import Event, State, TrackedValue
+from ambid.recursive.lines import Choice, Event, State, TrackedValue
 from ambid.tracking.diagnosis import LONGEST_S, Diagnosis
 from ambid.tracking.evidence import Evidence, RecentSamples, Samples
 from ambid.tracking.gate import Accepted, DecisionLog, Operator, Publication, beside, published
@@ -91,6 +91,14 @@ class Supervisor:
     def extra(self) -> dict[str, TrackedValue]:
         """Published numbers beside the parameters: gains of sensors once they are found to have changed, unbalance."""
         return beside(self.rpem.numbers, self.publication.accepted, self.rpem.filter.active, stale=not self._trusted())
+
+    @property
+    def choices(self) -> dict[str, Choice]:
+        """What the orders of an operator would put in force now."""
+        return {
+            name: Choice(t=goal.t, parameters=published(self.rpem.numbers, goal, "parameter", self._fresh))
+            for name, goal in self.publication.goals(self._now, searching=self.diagnosis.searching).items()
+        }
 
     @property
     def error(self) -> float:
