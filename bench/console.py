@@ -1,8 +1,8 @@
 """The console at real pace: what worker and server take, how soon a sample is a pixel, and whether anything grows.
 
 ``PYTHONPATH=. python bench/console.py [SECONDS]``: a record of an unstable bearing at 20 kHz is replayed, recorded and
-tracked with its three signals, then eight signals are shown without tracking; where Chromium and Playwright are
-installed, a page watches. Figures are printed; none is asserted.
+tracked with its three signals, then eight signals are shown without tracking; where Chromium is installed, a page
+watches. Figures are printed; none is asserted.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ambid.record import read_record, write_record
 from ambid.rig import write_rig
 from ambid.rig.draft import rig_of_preset
 from ambid.tracking.blocks import Block, Frame
+from tests.console.browser import CHROMIUM, chromium
 from tests.console.pages import Started, console, prototype_rig
 from tracking_benches import RATE, preset_bench, record_of
 
 SIGNALS = 8
 BLOCK = 100
-CHROMIUM = "/usr/bin/chromium"
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -91,7 +91,8 @@ def write(place: Path, seconds: float) -> None:
     """Stand for a worker: eight signals at 20 kHz as envelopes, at real pace."""
     Run(place).claim()
     view = SimpleNamespace(units={f"signal {k}": "V" for k in range(SIGNALS)}, rate_hz=RATE, block=lambda block: block)
-    tap, wave = EnvelopeTap(FeedWriter(place), view), np.random.default_rng(1).normal(size=(BLOCK, SIGNALS))  # type: ignore[arg-type]
+    journal = SimpleNamespace(stored=True, written=2**62)
+    tap, wave = EnvelopeTap(FeedWriter(place), view, journal), np.random.default_rng(1).normal(size=(BLOCK, SIGNALS))  # type: ignore[arg-type]
     begin, n = time.perf_counter(), 0
     while n < seconds * RATE:
         time.sleep(max(0.0, begin + (n + BLOCK) / RATE - time.perf_counter()))
@@ -147,23 +148,16 @@ def told_by(run: Run) -> Iterator[dict[str, Any]]:
 @contextmanager
 def viewer(page: Started, run: Run) -> Iterator[Any]:
     """Watch in Chromium, or by a client that takes everything and draws nothing."""
-    try:
-        from playwright.sync_api import sync_playwright
-    except ModuleNotFoundError:
+    if CHROMIUM is None:
         with page.feed(run.id):
-            yield lambda: "none: Playwright is not installed"
+            yield lambda: "none: Chromium is not installed"
         return
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        sheet = browser.new_context(viewport={"width": 1366, "height": 768})
+    with chromium() as browser:
+        shown = browser.open()
         name, _, value = page.cookie.partition("=")
-        sheet.add_cookies([{"name": name, "value": value, "url": f"http://{page.host}"}])
-        shown = sheet.new_page()
-        shown.goto(f"http://{page.host}/")
-        while not shown.evaluate(
-            "window.ambidConsole?.feed?.updates > 0"
-        ):  # the page forbids to wait for an expression
-            time.sleep(0.1)
+        shown.send("Network.setCookie", name=name, value=value, url=f"http://{page.host}/", httpOnly=True)
+        shown.goto(f"http://{page.host}/#key={page.key}")
+        shown.until("ambidConsole.feed?.updates > 0")
         first = shown.evaluate("[ambidConsole.feed.updates, performance.now()]")
 
         def seen() -> str:
@@ -173,7 +167,6 @@ def viewer(page: Started, run: Run) -> Iterator[Any]:
             return f"{rate:.1f} updates/s, sample to pixel median {low:.0f} ms, 95 % {high:.0f} ms"
 
         yield seen
-        browser.close()
 
 
 if __name__ == "__main__":

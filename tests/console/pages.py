@@ -1,5 +1,7 @@
 """A console as its user starts it, and clients that speak HTTP and websockets with it by hand."""
 
+import hashlib
+import hmac
 import http.client
 import json
 import os
@@ -18,12 +20,17 @@ class Started:
     def __init__(self, process, link):
         self.process, self.link = process, link
         self.host, self.token = re.fullmatch(r"http://([^/]+)/\?token=(\S+)", link).groups()
-        self.cookie = ""
+        self.cookie = self.key = ""
 
     def open(self):
         answer = self.ask("GET", f"/?token={self.token}", cookie="")
         self.cookie = answer.headers["set-cookie"].partition(";")[0]
+        self.key = answer.headers["location"].partition("#key=")[2]
         return self
+
+    def proof(self, path):
+        """What the page makes of its key for an address that a browser opens by itself."""
+        return f"{path}?proof={hmac.new(self.key.encode(), path.encode(), hashlib.sha256).hexdigest()}"
 
     def ask(self, method, path, body=None, *, cookie=None, headers=(), host=None):
         line = http.client.HTTPConnection(self.host, timeout=20)
@@ -33,6 +40,7 @@ class Started:
             line.putheader("Cookie", cookie or self.cookie)
         data = b"" if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
         own = {"X-Ambid": PAGE, "Content-Type": "application/json"} if method == "POST" else {}
+        own |= {"X-Ambid-Key": self.key} if self.key else {}
         for name, value in {**own, **dict(headers)}.items():
             if value is not None:
                 line.putheader(name, value)
@@ -53,11 +61,16 @@ class Started:
     def number(self, name):
         return next(f["number"] for f in self.state()["files"] if f["name"] == name)
 
-    def feed(self, name, **more):
+    def say(self, run, word, *, page=PAGE, **more):
+        """Order something, of the state that the run is in now."""
+        body = {"word": word, "beat": run.status.get("beat"), **more}
+        return self.json("POST", f"/api/runs/{run.id}/say", body, headers={"X-Ambid": page})
+
+    def feed(self, name, *, page=PAGE, **more):
         from websockets.sync.client import connect
 
         headers, origin = {"Cookie": self.cookie, **more.pop("headers", {})}, more.pop("origin", f"http://{self.host}")
-        where = f"ws://{self.host}/api/runs/{name}/feed"
+        where = f"ws://{self.host}{self.proof(f'/api/runs/{name}/feed')}&page={page}"
         return connect(where, additional_headers=headers, compression=None, origin=origin, **more)
 
 
@@ -74,6 +87,13 @@ def console(folder, *words):
         process.wait()
         process.stdout.close()
         process.stderr.close()
+
+
+def frames_of(feed):
+    """The JSON frames that a viewer gets until the end of a run."""
+    from ambid.console.feed import json_frames
+
+    return [m for data in feed for m in (json.loads(data) if isinstance(data, str) else json_frames(data))]
 
 
 def told(frames, kind):

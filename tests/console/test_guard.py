@@ -6,6 +6,7 @@ import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,11 +15,10 @@ pytest.importorskip("starlette", reason="the extra [console] is not installed")
 
 from websockets.exceptions import InvalidStatus, WebSocketException
 
-from ambid.console.feed import json_frames
 from ambid.console.folder import Folder, open_plain
 from ambid.console.runs import Heard, Run, Runs
 from ambid.errors import AmbidError
-from tests.console.pages import PAGE, console, told, until
+from tests.console.pages import PAGE, Started, console, frames_of, told, until
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +99,51 @@ def test_a_foreign_origin_is_refused(page, origin):
     assert page.ask("GET", "/api/state", headers=sent).status == 403
 
 
+@pytest.mark.parametrize("second", ["null", "http://evil.example", "http://{host}", ""])
+def test_two_origins_are_refused(page, second):
+    ours = f"Host: {page.host}\r\nCookie: {page.cookie}\r\nX-Ambid: {PAGE}\r\nX-Ambid-Key: {page.key}\r\n"
+    for head in ("GET /api/state", "POST /api/stop"):
+        with socket.create_connection(page.host.rsplit(":", 1), timeout=5) as line:
+            line.sendall(
+                f"{head} HTTP/1.1\r\n{ours}Content-Type: application/json\r\nOrigin: http://{page.host}\r\n"
+                f"Origin: {second.format(host=page.host)}\r\n\r\n".encode()
+            )
+            assert line.recv(4096).startswith(b"HTTP/1.1 403")
+
+
+def test_a_cookie_that_another_port_received_opens_nothing_without_the_key(page):
+    """As a server on another port of the address replays it, with our Host and our Origin."""
+    ours = {"Origin": f"http://{page.host}", "X-Ambid-Key": None}
+    report = next(f["number"] for f in page.state()["files"] if f["kind"] == "report")
+    for path in ("/api/state", "/api/rigs/1", f"/reports/{report}", f"/reports/{report}?proof=", "/api/runs/1-1/feed"):
+        assert page.ask("GET", path, headers=ours).status == 403
+    for path in ("/api/stop", "/api/drive", "/api/runs", "/api/previews", "/api/runs/1-1/say"):
+        assert page.ask("POST", path, {}, headers=ours).status == 403
+        assert page.ask("POST", path, {}, headers={**ours, "X-Ambid-Key": page.cookie.partition("=")[2]}).status == 403
+    bare = page.ask("GET", "/", headers=ours)  # which holds nothing of the folder, and no key
+    assert bare.status == 200
+    assert page.key.encode() not in bare.body
+    with pytest.raises((InvalidStatus, WebSocketException)):
+        Started.feed(SimpleNamespace(cookie=page.cookie, host=page.host, proof=lambda path: f"{path}?proof=x"), "1-1")
+    other = page.proof("/reports/999999").partition("?")[2]  # of another address
+    assert page.ask("GET", f"/reports/{report}?{other}", headers=ours).status == 403
+    assert page.ask("GET", page.proof(f"/reports/{report}"), headers=ours).status == 200
+
+
+BENCH = 'schema = "ambid.rig/1"\nname = "planted"\nmodel = "one-axis"\n[daq]\nrate_hz = 2000.0\nbench = "{}"\n'
+
+
+@pytest.mark.parametrize("bench", ["../outside/secret.toml", "linked.toml", "{made}/outside/secret.toml"])
+def test_a_bench_of_a_rig_lies_in_the_folder(folder, monkeypatch, bench):
+    from ambid.acquisition.devices.benches import bench_of
+    from ambid.rig import rig_from_text
+
+    rig = rig_from_text(BENCH.format(bench.format(made=folder.parent)), folder / "planted.toml")
+    monkeypatch.setattr("ambid.record.record.INSIDE", [folder])
+    with pytest.raises(AmbidError, match="is outside of"):
+        bench_of(rig, None)
+
+
 def test_a_change_needs_the_header_and_json(page):
     for headers in ({"X-Ambid": None}, {"Content-Type": "text/plain"}, {"Content-Type": "multipart/form-data"}):
         assert page.ask("POST", "/api/drive", {}, headers=headers).status == 403
@@ -116,7 +161,7 @@ PATHS = [
 
 @pytest.mark.parametrize("path", PATHS)
 def test_no_path_leads_out_of_the_folder(page, path):
-    answer = page.ask("GET", path)
+    answer = page.ask("GET", page.proof(path) if path.startswith("/reports/") else path)
     assert answer.status in (400, 404, 405)
     assert b"secret" not in answer.body
     assert b"root:" not in answer.body
@@ -224,7 +269,7 @@ def test_a_websocket_needs_the_cookie_and_a_run(page):
 def test_pages_and_reports_cannot_run_what_is_planted(page):
     assert "script-src 'self'" in page.ask("GET", "/").headers["content-security-policy"]
     report = next(f for f in page.state()["files"] if f["kind"] == "report")
-    answer = page.ask("GET", f"/reports/{report['number']}")
+    answer = page.ask("GET", page.proof(f"/reports/{report['number']}"))
     assert answer.headers["content-security-policy"].startswith("sandbox allow-scripts")
     assert "allow-same-origin" not in answer.headers["content-security-policy"]
     assert answer.headers["x-content-type-options"] == "nosniff"
@@ -239,7 +284,7 @@ def test_read_only_changes_nothing(folder):
         assert started.ask("POST", "/api/previews", {"job": "rig", "text": "", "out": "new"}).status == 400
         begun = started.json("POST", "/api/previews", {"job": "preview", "record": started.number("sub/plain.csv")})
         with started.feed(begun["id"]) as feed:
-            assert told([m for data in feed for m in json_frames(data)], "end")
+            assert told(frames_of(feed), "end")
         assert sorted(folder.rglob("*")) == before
         assert started.ask("POST", "/api/runs/0000000000-000000/say", {"word": "stop"}).status == 403
         assert started.state()["read_only"] is True

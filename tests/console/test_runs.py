@@ -23,7 +23,7 @@ from ambid.errors import AmbidError
 from ambid.job import load
 from ambid.record import read_record
 from ambid.rig import rig_from_text
-from tests.console.pages import console, prototype_rig, told, until
+from tests.console.pages import console, frames_of, prototype_rig, told, until
 from tests.tracking.tracks import track_of
 
 
@@ -107,10 +107,12 @@ def test_a_disk_that_takes_nothing_stops_no_run_and_is_told(tmp_path, monkeypatc
 
 
 def test_a_worker_that_dies_or_whose_folder_goes_is_told(tmp_path):
-    prototype_rig(tmp_path)
+    (tmp_path / "other").mkdir()
+    for folder in (tmp_path, tmp_path / "other"):
+        prototype_rig(folder)
     wish = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
             "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
-    gone = Runs(tmp_path).start({**wish, "out": "gone.h5"})
+    gone = Runs(tmp_path / "other").start({**wish, "out": "gone.h5"})
     with console(tmp_path) as page:
         page.open()
         run = Runs(tmp_path).one(page.json("POST", "/api/runs", {"job": "rig", "text": "x", "out": "x"})["id"])
@@ -119,7 +121,7 @@ def test_a_worker_that_dies_or_whose_folder_goes_is_told(tmp_path):
         until(killed, "spectrum")
         with page.feed(killed.id) as feed:
             os.kill(json.loads((killed.place / "process.json").read_text(encoding="utf-8"))["pid"], signal.SIGKILL)
-            seen = [m for data in feed for m in json_frames(data)]  # to its end
+            seen = frames_of(feed)  # to its end
         assert told(seen, "spectrum")
         assert not told(seen, "end")
     assert not killed.alive
@@ -129,9 +131,9 @@ def test_a_worker_that_dies_or_whose_folder_goes_is_told(tmp_path):
     until(gone, "spectrum")
     shutil.rmtree(gone.place)
     end = time.monotonic() + 20.0
-    while not (tmp_path / "gone.h5").exists() and time.monotonic() < end:
+    while not (tmp_path / "other" / "gone.h5").exists() and time.monotonic() < end:
         time.sleep(0.05)
-    assert read_record(tmp_path / "gone.h5").n_samples > 1900
+    assert read_record(tmp_path / "other" / "gone.h5").n_samples > 1900
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +155,7 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
         page.open()
         begun = page.json("POST", "/api/runs", {"job": "preview", "record": page.number("rec.csv")})
         with page.feed(begun["id"]) as feed:
-            (shown,) = told([m for data in feed for m in json_frames(data)], "preview")
+            (shown,) = told(frames_of(feed), "preview")
         assert not (tmp_path / ".ambid").exists()  # of a look nothing stays
         assert [c["name"] for c in shown["channels"]] == ["voltage", "current", "position"]
         wish = {"job": "rig", "text": shown["draft"], "out": "drafted"}
@@ -192,7 +194,7 @@ def test_a_ledger_is_shown_over_time_without_numbers_that_are_not_known(tmp_path
         def look(name, **more):
             wish = {"job": "history", "ledger": page.number(name), **more}
             with page.feed(page.json("POST", "/api/previews", wish)["id"]) as feed:
-                return [m for data in feed for m in json_frames(data)]
+                return frames_of(feed)
 
         seen = look("works.db", bearing='B"; DROP TABLE value')
         assert told(seen, "bearings")[0]["names"] == ["A", 'B"; DROP TABLE value']
@@ -224,7 +226,7 @@ def test_tables_of_a_rig_lie_in_the_folder(tmp_path, monkeypatch, name):
     shutil.copy(outside, shown / "inside.csv")
     (shown / "linked.csv").symlink_to(outside)
     (shown / "way").symlink_to(tmp_path)
-    monkeypatch.setattr("ambid.record.calibration.INSIDE", [shown])
+    monkeypatch.setattr("ambid.record.record.INSIDE", [shown])
     rig = f'schema = "ambid.rig/1"\n{ELSEWHERE}'
     with pytest.raises(AmbidError, match="is outside of"):
         rig_from_text(rig.format(name.format(outside=outside)), shown / "rig.toml")
@@ -241,18 +243,16 @@ def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
             if run is None:
                 started = page.json("POST", "/api/runs", {**wish, "rig": page.number("rig.toml"), "out": "run"})
                 run = Runs(bench).one(started["id"])
-                early = page.json("POST", f"/api/runs/{run.id}/say", {"word": "accept"})
-                assert "tracks nothing now" in early["error"]
+                until(run, "beat")
+                assert "tracks nothing now" in page.say(run, "accept")["error"]
                 until(run, "header")
                 second = page.json("POST", "/api/runs", {**wish, "rig": page.number("rig.toml"), "out": "two"})
-                assert "under way" in second["error"]
+                assert "in use by the run live run.h5, started by page page-1" in second["error"]
             (found,) = [r for r in page.state()["runs"] if r["id"] == run.id]
             assert found["alive"]
-            path = f"/api/runs/{run.id}/say"
             if k == 0:
-                assert page.ask("POST", path, {"word": "hold"}).status == 200
-                other = page.ask("POST", path, {"word": "accept"}, headers={"X-Ambid": "page-2"})
-                assert b"another page has the machine" in other.body
+                assert page.say(run, "hold") == {"delivered": True}
+                assert "page page-1 of the console at" in page.say(run, "accept", page="page-2")["error"]
             with page.feed(run.id) as feed:
                 assert json_frames(feed.recv(timeout=5))[0]["kind"] == "begin"
             # the console is killed here
@@ -271,24 +271,23 @@ def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
         time.sleep(0.05)
     assert not run.alive
     with console(bench) as page:
-        late = page.open().json("POST", f"/api/runs/{run.id}/say", {"word": "hold"})
-        assert "the run is over" in late["error"]
+        assert "the run is over" in page.open().say(run, "hold")["error"]
 
 
 def test_a_stopped_commissioning_tells_what_was_reached_and_takes_no_word_of_tracking(bench):
     with console(bench) as page:
         wish = {"job": "commission", "port": "simulated", "seconds": 4.0, "rig": page.open().number("rig.toml")}
         run = Runs(bench).one(page.json("POST", "/api/runs", {**wish, "out": "halted"})["id"])
-        path = f"/api/runs/{run.id}/say"
         for word in ("hold", "track", "accept", "revert"):
-            assert "is for a run of live" in page.json("POST", path, {"word": word})["error"]
+            assert "is for a run of live" in page.say(run, word)["error"]
         (asked,) = told(until(run, "ask"), "ask")
-        page.ask("POST", path, {"word": "go", "number": asked["number"] - 1})  # an answer to another question is none
+        old = page.say(run, "go", number=asked["number"] - 1)  # an answer to another question is none
+        assert "no longer asked" in old["error"]
         beats = told(until(run, "beat"), "beat")
         assert beats, "a run that waits is not silent"
-        page.ask("POST", path, {"word": "go", "number": asked["number"]})
+        assert page.say(run, "go", number=asked["number"]) == {"delivered": True}
         until(run, "beginning", of={"name": "levitate"})
-        page.ask("POST", path, {"word": "stop"})
+        assert page.say(run, "stop") == {"delivered": True}
         seen = until(run)
         (made,) = told(seen, "commissioned")
         names = ["self-test", "rest", "polarity", "levitate"]  # it may be over before the word comes

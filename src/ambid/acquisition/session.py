@@ -442,15 +442,21 @@ class Recording:
         self._every = max(1, round(listeners.get("every_s", 0.25) * rate_hz))
         self._wanted = round(course.seconds * rate_hz)
         self._samples = self._shown = 0
+        self.stored = False  # whether the last block found room
 
     @property
     def failed(self) -> DeviceError | None:
         """Why nothing more is stored; None as long as all is well."""
         return self._recorder.failed
 
+    @property
+    def written(self) -> int:
+        """Number of the sample up to which a kill of this process loses nothing of what it `stored`."""
+        return self._recorder.written
+
     def take(self, frame: Frame) -> None:
         """Take a block as it came."""
-        self._recorder.append(frame.block)
+        self.stored = self._recorder.append(frame.block)
         self._quality.add(frame)
         self._samples += len(frame.block.values)
         if self._on_progress is not None and self._samples - self._shown >= self._every:

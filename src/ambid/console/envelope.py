@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import struct
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -25,19 +28,40 @@ _LINES = 160  # of a spectrum
 _HEAD = struct.Struct("<QQIHHdd")  # first sample, samples lost, envelopes, channels, samples of each, end s, wall clock
 
 
-class EnvelopeTap:
-    """Takes the blocks of a run, and writes envelopes of its roles into a feed.
+@dataclass(slots=True, kw_only=True)
+class _Stretch:
+    """Samples without a gap that wait to be shown."""
 
-    `view`: of device and rig.
+    first: int  # number of the first one
+    rows: list[Array] = field(default_factory=list)
+    n: int = 0
+
+
+class Journal(Protocol):
+    """What stores a run: `stored`, whether the last block found room; `written`, the number of the sample up to which
+    nothing that found room is lost where the process dies.
     """
 
-    def __init__(self, feed: FeedWriter, view: BenchView) -> None:
-        self._feed, self._view = feed, view
+    stored: bool
+
+    @property
+    def written(self) -> int:
+        """See above."""
+        ...
+
+
+class EnvelopeTap:
+    """Takes the blocks of a run, and writes envelopes of its roles into a feed, of a sample once the journal has it.
+
+    `view`: of device and rig; `journal`: takes each block before.
+    """
+
+    def __init__(self, feed: FeedWriter, view: BenchView, journal: Journal) -> None:
+        self._feed, self._view, self._journal = feed, view, journal
         self._group = max(1, round(view.rate_hz / _PER_SECOND))
-        self._rows: list[Array] = []
-        self._waiting = self._lost = 0
+        self._stretches = deque[_Stretch]()
+        self._lost = self._next = 0
         self._origin: int | None = None
-        self._next = self._first = 0
         self._written_s = 0.0
         self._recent: list[Array] = []
         self._recent_n, self._spectrum_at = 0, 0
@@ -52,43 +76,61 @@ class EnvelopeTap:
         """Take a block."""
         block = frame.block
         if self._origin is None:
-            self._origin = self._next = self._first = block.first
+            self._origin = self._next = block.first
+            self._begin(block.first)
         if block.first > self._next:  # a gap is drawn as one
             self._lost += block.first - self._next
-            self._flush(frame.arrived_s, 0)
-            self._first = block.first
+            self._begin(block.first)
         self._next = block.first + len(block.values)
-        self._rows.append(block.values)
-        self._waiting += len(block.values)
-        if frame.arrived_s - self._written_s >= _EVERY_S:
-            self._flush(frame.arrived_s, self._waiting % self._group)
+        if self._journal.stored:
+            self._stretches[-1].rows.append(block.values)
+            self._stretches[-1].n += len(block.values)
+        else:
+            self._lost += len(block.values)
+            self._begin(self._next)
+        if frame.arrived_s - self._written_s >= _EVERY_S and self._flush(frame.arrived_s):
             self._written_s = frame.arrived_s
 
-    def _flush(self, arrived_s: float, keep: int) -> None:
-        """Write what waits, but for the last `keep` samples."""
-        n = (self._waiting - keep) // self._group
-        if not n:
-            if not keep:
-                self._rows, self._waiting = [], 0
-            return
-        rows = np.vstack(self._rows)
-        seen = self._seen(rows[: n * self._group])
+    def end(self) -> None:
+        """Show the last samples, which the journal has by now."""
+        self._flush(time.perf_counter())
+
+    def _begin(self, first: int) -> None:
+        self._stretches.append(_Stretch(first=first))
+
+    def _flush(self, arrived_s: float) -> bool:
+        """Write what the journal has, in whole envelopes; whether there was any."""
+        some, written = False, self._journal.written
+        while self._stretches:
+            part = self._stretches[0]
+            n = min(part.n, max(0, written - part.first)) // self._group
+            if n:
+                some = True
+                self._write(part, n, arrived_s)
+            if len(self._stretches) == 1 or part.n >= self._group:
+                break
+            self._stretches.popleft()
+        return some
+
+    def _write(self, part: _Stretch, n: int, arrived_s: float) -> None:
+        """Write the first `n` envelopes of a stretch."""
+        rows, end = np.vstack(part.rows), n * self._group
+        seen = self._seen(rows[:end])
         self._remember(seen)
         cut = seen.reshape(len(seen), n, self._group)
         both = np.stack([cut.min(axis=2), cut.max(axis=2)], axis=2).transpose(1, 0, 2)  # (n, channels, 2)
         assert self._origin is not None
-        end_s = (self._first + n * self._group - self._origin) / self._view.rate_hz
-        wall = time.time() - (time.perf_counter() - arrived_s)
-        head = _HEAD.pack(self._first - self._origin, self._lost, n, len(seen), self._group, end_s, wall)
+        first, part.first = part.first - self._origin, part.first + end
+        part.rows, part.n = [rows[end:]], part.n - end
+        rate_hz = self._view.rate_hz
+        wall = time.time() - (time.perf_counter() - arrived_s) - (self._next - part.first) / rate_hz
+        head = _HEAD.pack(first, self._lost, n, len(seen), self._group, (first + end) / rate_hz, wall)
         self._feed.envelope(head + both.tobytes())
-        rest = rows[n * self._group :]
-        self._first += n * self._group
-        self._rows, self._waiting = ([rest] if len(rest) and keep else []), (len(rest) if keep else 0)
 
     def _seen(self, rows: Array) -> Array:
         """Return rows of the device as signals, (n_channels, n_samples), of four bytes each: enough for eyes."""
         try:
-            values = self._view.block(Block(first=self._first, time_s=0.0, values=rows)).values
+            values = self._view.block(Block(first=0, time_s=0.0, values=rows)).values
         except AmbidError:  # outside a calibration: nothing to be drawn
             values = np.full((len(rows), len(self._view.units)), np.nan)
         return np.ascontiguousarray(values.T, dtype="<f4")

@@ -13,6 +13,7 @@ import os
 import struct
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ambid.console.folder import open_plain
 _HEAD = struct.Struct("<Ic")
 _PART = 2 << 20  # bytes after which a new part begins: 2.7 minutes of eight signals at 200 envelopes a second
 _KEPT = 24  # parts: about an hour
+_SPARE = 1 << 16
 _LONGEST = 1 << 26  # bytes of a frame; what claims more is damaged
 
 
@@ -39,13 +41,21 @@ class FeedWriter:
         self._number = next_part(folder)
         self._file: FileIO | None = None
         self._missed, self._closed = 0, False
+        self._spare = folder / "spare"  # room that the end of a run needs on a full disk
+        with suppress(OSError):
+            self._spare.write_bytes(bytes(_SPARE))
 
-    def tell(self, kind: str, content: Mapping[str, Any], *, sticky: str | None = None) -> None:
-        """Append a JSON frame of a `kind`; the last one under each name `sticky` begins each later part."""
+    def tell(self, kind: str, content: Mapping[str, Any], *, sticky: str | None = None, last: bool = False) -> None:
+        """Append a JSON frame of a `kind`; the last one under each name `sticky` begins each later part; the `last` one
+        of all has room that was kept for it.
+        """
         frame = _json_frame(kind, content)
         with self._lock:
             if sticky is not None:
                 self._sticky[sticky] = frame
+            if last:
+                with suppress(OSError):
+                    self._spare.unlink(missing_ok=True)
             self._append(frame)
 
     def keep(self, kind: str, content: Callable[[], Mapping[str, Any]]) -> None:
@@ -62,6 +72,7 @@ class FeedWriter:
         """End the feed."""
         with self._lock:
             self._closed = True
+            self._spare.unlink(missing_ok=True)
             if self._file is not None:
                 self._file.close()
 

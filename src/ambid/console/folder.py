@@ -12,6 +12,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from ambid.console.slot import opened
 from ambid.errors import AmbidError
 from ambid.record import ENDINGS
 
@@ -142,13 +143,8 @@ def plain(path: Path, folder: Path) -> os.stat_result | None:
 
 
 def open_plain(path: Path) -> FileIO:
-    """Open a plain file for reading: what is a link, a pipe or a device raises `OSError` and is not waited for."""
-    how = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
-    file = FileIO(os.open(path, how))
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
-        raise OSError(f"{path.name} is no plain file")
-    return file
+    """Open a plain file for reading."""
+    return FileIO(opened(path, os.O_RDONLY))
 
 
 def _said(path: Path, kind: str) -> tuple[str, str, str]:

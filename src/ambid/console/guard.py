@@ -1,13 +1,16 @@
 """Who may do what: the one door through which every request of a console comes.
 
 The page is for the person who started it. A one-time token in the link becomes a cookie that scripts cannot read and
-other sites cannot send; Host and Origin must be the console's own, so that no other page, and no name that is bound to
-the loopback address later, reaches it; what changes something needs a header that a plain form cannot send.
+other sites cannot send, and a key that the page keeps: browsers send the cookie to every port of an address, the key to
+nobody. All but the bare page needs both. Host and Origin must be the console's own, so that no other page, and no name
+that is bound to the loopback address later, reaches it; what changes something needs a header that a plain form cannot
+send.
 """
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import hmac
 import secrets
 from collections.abc import Iterable, MutableMapping
@@ -22,10 +25,12 @@ from ambid.settings.caller import flag
 
 COOKIE = "ambid_console"
 HEADER = b"x-ambid"
+KEY = b"x-ambid-key"
 MOST_BYTES = 1 << 16  # of the body of a request
 BODY_S = 10.0  # in which it has to come
 MOST_HEADERS = 1 << 14
 _SANDBOXED = "/reports/"
+_BARE = "/static/"  # holds nothing of the folder
 _CHANGES_NOTHING = "/api/previews"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -52,7 +57,7 @@ class Guard:
         self.cookie = f"{COOKIE}_{next(iter(self._hosts)).rpartition(':')[2]}"  # ports of an address share cookies
         self._password, self._read_only = password, read_only
         self.token: str | None = secrets.token_urlsafe(32)
-        self._sessions: set[str] = set()
+        self._sessions: dict[str, str] = {}  # cookies, and the key of each
         self._wrong = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -90,7 +95,7 @@ class Guard:
         if origin and origin != f"{self._scheme}://{host}":
             return _no(403, "the request comes from another page")
         if scope["type"] == "websocket":
-            return None if origin and self._known(headers) else _no(403, "")
+            return None if origin and self._known(headers, scope) else _no(403, "")
         if scope["method"] == "POST":
             if self._password is not None and scope["path"] == "/login":
                 return None
@@ -103,7 +108,7 @@ class Guard:
             return _no(405, "GET and POST only")
         if scope["path"] == "/" and scope["query_string"]:
             return self._opened(parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0])
-        if not self._known(headers):
+        if not self._known(headers, scope):
             if self._password is not None and scope["path"] == "/":
                 return Response(_LOGIN, media_type="text/html")
             return _no(403, "open the link that 'ambid console' printed; each link opens one page. Start it again")
@@ -129,21 +134,35 @@ class Guard:
         return self._session()
 
     def _session(self) -> Response:
-        session = secrets.token_urlsafe(32)
-        self._sessions.add(session)
-        answer = RedirectResponse("/", status_code=303)
+        """Begin a session: the key goes into the fragment of an address, which browsers send to no server."""
+        session, key = secrets.token_urlsafe(32), secrets.token_urlsafe(32)
+        self._sessions[session] = key
+        answer = RedirectResponse(f"/#key={key}", status_code=303)
         answer.set_cookie(
             self.cookie, session, httponly=True, samesite="strict", secure=self._scheme == "https", path="/"
         )
         return answer
 
-    def _known(self, headers: MutableMapping[bytes, bytes]) -> bool:
+    def _known(self, headers: MutableMapping[bytes, bytes], scope: Scope) -> bool:
+        """Whether a request has the cookie of a session and, for all but the bare page, its key: in a header, or as
+        what it makes of an address that a browser opens by itself.
+        """
         try:
             found = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1")).get(self.cookie)
         except CookieError:
             return False
         given = "" if found is None else found.value
-        return any(hmac.compare_digest(given.encode(), s.encode()) for s in self._sessions)
+        key = next((k for s, k in self._sessions.items() if hmac.compare_digest(given.encode(), s.encode())), None)
+        if key is None:
+            return False
+        path = scope["path"]
+        if path == "/" or path.startswith(_BARE):
+            return True
+        if scope["type"] == "websocket" or path.startswith(_SANDBOXED):
+            proof = parse_qs(scope["query_string"].decode("latin-1")).get("proof", [""])[0]
+            right = hmac.new(key.encode(), path.encode(), hashlib.sha256).hexdigest()
+            return hmac.compare_digest(proof.encode(), right.encode())
+        return hmac.compare_digest(headers.get(KEY, b""), key.encode())
 
 
 _LOGIN = (
@@ -154,10 +173,10 @@ _LOGIN = (
 
 
 def _headers(scope: Scope) -> MutableMapping[bytes, bytes]:
-    """Return the headers; of those that occur twice, where that changes who is asked, none."""
+    """Return the headers; one that occurs twice, where that changes who is asked, is nobody's."""
     found: dict[bytes, bytes] = {}
     for name, value in scope["headers"]:
-        found[name] = b"" if name in found and name in (b"host", b"origin", b"cookie") else value
+        found[name] = b"twice" if name in found and name in (b"host", b"origin", b"cookie", HEADER, KEY) else value
     return found
 
 

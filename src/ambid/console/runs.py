@@ -1,7 +1,8 @@
 """Runs: what a console has started in a folder, each a process of its own with a folder of its own.
 
-``FOLDER/.ambid/runs/ID/``: ``spec.json`` (what is wanted), ``process.json`` (who does it), ``control.jsonl`` (what the
-operator said), the feed, and ``log.txt``. A console that starts anew finds them there.
+``FOLDER/.ambid/runs/ID/``: ``spec.json`` (what is wanted), ``process.json`` (who does it), ``control.jsonl`` (what
+operators ordered), ``orders.jsonl`` (what became of that), ``lease.bin`` (who may order), ``status.bin`` (how the run
+is, also on a full disk), the feed, and ``log.txt``. A console that starts anew finds them there.
 """
 
 from __future__ import annotations
@@ -20,9 +21,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from ambid.console.authority import Lease, Machine
 from ambid.console.folder import open_plain
+from ambid.console.orders import Desk
+from ambid.console.slot import Slot
 from ambid.errors import AmbidError
 
+MOVING = ("live", "commission")
+"""Jobs that may move the machine: a folder has one such run at a time, and one page orders it."""
 _ID = re.compile(r"[0-9]{10}-[0-9a-f]{6}")
 _KEPT = 200  # runs that are over; older ones are removed when one begins
 
@@ -50,18 +56,26 @@ class Run:
         return isinstance(pid, int) and isinstance(began, float) and 0 < pid < 1 << 31 and process_began(pid) == began
 
     @property
+    def status(self) -> dict[str, Any]:
+        """How it is, as its process wrote it last: see `Desk`."""
+        return Slot(self.place / "status.bin").read()
+
+    @property
     def follows(self) -> bool:
         """Whether it tracks a live bench now."""
-        return self.alive and (self.place / "follows").exists()
+        return self.alive and self.status.get("follows") is True
 
-    def follow(self, *, on: bool) -> None:
-        """Note whether it does."""
-        with suppress(OSError):
-            (self.place / "follows").touch() if on else (self.place / "follows").unlink(missing_ok=True)
+    @property
+    def lease(self) -> Lease:
+        """The right to order it."""
+        return Lease(self.place)
 
-    def say(self, word: str, **more: Any) -> None:
-        """Tell the process something; it is appended, and read within 20 ms. A full disk hinders no stop."""
-        line = json.dumps({"word": word, **more})
+    def say(self, word: str, **more: Any) -> str:
+        """Order something; it is appended, and read within 20 ms. A full disk hinders no stop. Returns what the answer
+        is known by.
+        """
+        name = secrets.token_hex(6)
+        line = json.dumps({"word": word, "id": name, "at": time.time(), **more})
         how = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         try:
             fd = os.open(self.place / "control.jsonl", how, 0o600)
@@ -73,6 +87,13 @@ class Run:
             if word != "stop" or not self.alive:
                 raise
             os.kill(_read(self.place / "process.json")["pid"], signal.SIGTERM)
+        return name
+
+    def answer(self, name: str) -> dict[str, Any] | None:
+        """Return what its process answered to an order; None as long as it did not."""
+        answers = self.status.get("answers")
+        found = [a for a in answers if isinstance(a, dict)] if isinstance(answers, list) else []
+        return next((a for a in found if a.get("id") == name), None)
 
     def claim(self) -> None:
         """Note that this process does it."""
@@ -118,26 +139,45 @@ class Runs:
         self.folder = folder
         self._place = folder / ".ambid" / "runs" if place is None else place
 
-    def start(self, spec: Mapping[str, Any]) -> Run:
-        """Begin a run in a process that outlives this one."""
+    def start(self, spec: Mapping[str, Any], *, page: str = "", by: str = "this machine") -> Run:
+        """Begin a run in a process that outlives this one; `page`: that may order it, of the name `by`."""
         if not self._own:
             raise AmbidError("the folder .ambid is a link; runs are kept in the folder itself. Remove it")
         self._place.mkdir(parents=True, exist_ok=True)
+        machine = Machine(self.folder, str(spec.get("port", ""))) if spec["job"] in MOVING else None
+        if machine is not None:
+            machine.seize({"job": spec["job"], "out": str(spec.get("out", ""))[:80], "by": by})
+        try:
+            if machine is not None and any(r.alive and r.spec.get("job") in MOVING for r in self.all()):
+                raise AmbidError("a run that moves the machine is under way. Stop it first")
+            return self._begin(spec, machine, page, by)
+        finally:
+            if machine is not None:
+                machine.release()
+
+    def _begin(self, spec: Mapping[str, Any], machine: Machine | None, page: str, by: str) -> Run:
         for old in self.all()[_KEPT:]:
             if not old.alive:
                 shutil.rmtree(old.place, ignore_errors=True)
         place = self._place / f"{int(time.time()):010d}-{secrets.token_hex(3)}"
         place.mkdir(mode=0o700)
         _write(place / "spec.json", {**spec, "folder": str(self.folder)})
+        run, locks = Run(place), [] if machine is None else machine.locks
+        Desk(place)
+        if machine is not None:
+            run.lease.slot.make()
+            if page:
+                run.lease.take(page, by)
         with (place / "log.txt").open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "ambid.console.worker", str(place)],
+                [sys.executable, "-m", "ambid.console.worker", str(place), *map(str, locks)],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                pass_fds=locks if os.name == "posix" else (),
                 cwd=place,  # never the folder: Python would run a numpy.py that is in it
             )  # fmt: skip
         _write(place / "process.json", {"pid": process.pid, "began": process_began(process.pid)})
         _CHILDREN.append(process)
-        return Run(place)
+        return run
 
     def all(self) -> list[Run]:
         """Return all runs, the newest first."""

@@ -6,6 +6,7 @@ Starlette and uvicorn (extra ``[console]``). Everything comes through `ambid.con
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import math
 import re
@@ -31,15 +32,18 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ambid.console.feed import FeedReader, json_frames
 from ambid.console.folder import Folder
 from ambid.console.guard import Guard
-from ambid.console.runs import Run, Runs
+from ambid.console.orders import ANSWER_S
+from ambid.console.runs import MOVING, Run, Runs
 from ambid.errors import AmbidError
 from ambid.settings.caller import setting
 
-MOVING = ("live", "commission")
-"""Jobs that may move the machine: one client at a time orders them."""
 _LOOKS = ("preview", "history")  # jobs that change nothing
 
 _POLL_S = 0.02  # between two looks at a feed
+_ANSWER_POLL_S = 0.005  # between two looks for an answer
+_STATUS_S = 0.1  # between two looks of a viewer at lease and status
+_SIGN_S = 0.4  # between two signs of life of a page that are kept
+_SILENT_S = 1.5  # without a sign of life: the process of a run is frozen
 _VIEWERS = 16  # feeds that are watched at once
 _BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
 _PATIENCE_S = 20.0  # with a viewer that takes nothing
@@ -87,7 +91,6 @@ class Console:
         self.files, self.runs, self._read_only = Folder(folder), Runs(folder), read_only
         self._beside = TemporaryDirectory(prefix="ambid-console-", ignore_cleanup_errors=True)
         self._looks = Runs(folder, Path(self._beside.name))  # previews: nothing of them stays
-        self._driver: str | None = None  # the page that orders what moves the machine
         self._viewers = 0
         self._over: dict[str, dict[str, Any]] = {}  # runs that are over, as they are shown
         self.guard: Guard | None = None
@@ -106,6 +109,7 @@ class Console:
             Route("/api/rigs/{number:int}", self._rig_text),
             *(Route(f"/api/{of}", self._start, methods=["POST"]) for of in ("runs", "previews")),
             *(Route(f"/api/{of}/{{name}}/say", self._say, methods=["POST"]) for of in ("runs", "previews")),
+            Route("/api/stop", self._stop, methods=["POST"]),
             Route("/api/drive", self._drive, methods=["POST"]),
             Route("/reports/{number:int}", self._report),
             WebSocketRoute("/api/runs/{name}/feed", self._feed),
@@ -133,23 +137,25 @@ class Console:
 
     async def _state(self, request: Request) -> Response:
         entries = await run_in_threadpool(self.files.entries)
-        runs = await run_in_threadpool(lambda: [self._about(r) for r in self.runs.all()[:40]])
+        page = _page_of(request)
+        runs = await run_in_threadpool(lambda: [self._about(r, page) for r in self.runs.all()[:40]])
         return _reply(
             {
                 "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
                 "left_out": self.files.left_out, "read_only": self._read_only,
-                "driver": _of(self._driver, request), "now": time.time(),
+                "page": _name_of(request), "now": time.time(),
             }
         )  # fmt: skip
 
-    def _about(self, run: Run) -> dict[str, Any]:
+    def _about(self, run: Run, page: str) -> dict[str, Any]:
         """Return what is shown of a run; one that is over is looked at once."""
         if run.id in self._over:
             return self._over[run.id]
         if run.alive:
-            return {**_about(run), "alive": True, "end": ""}
-        ends = [m for m in json_frames(FeedReader(run.place, parts=1).read(1 << 24)) if m.get("kind") == "end"]
-        how, why = (str(ends[-1].get(k, ""))[:400] for k in ("how", "why")) if ends else ("broke off", "")
+            moves = run.spec.get("job") in MOVING
+            return {**_about(run), "alive": True, "end": "", **(_holder(run, page) if moves else {})}
+        end = _end(run)
+        how, why = (str(end.get(k, ""))[:400] for k in ("how", "why")) if end else ("broke off", "")
         found = {**_about(run), "alive": False, "end": how[:20], "why": why}
         self._over[run.id] = found
         return found
@@ -175,29 +181,48 @@ class Console:
                 return {"id": self._looks.start(spec).id}
             if request.url.path != "/api/runs":
                 raise AmbidError(f"{spec['job']} changes the folder. Reload the page")
-            if spec["job"] in MOVING:
-                self._take_wheel(request)
-                if any(r.alive and r.spec.get("job") in MOVING for r in self.runs.all()):
-                    raise AmbidError("a run that moves the machine is under way. Stop it first")
-            return {"id": self.runs.start(spec).id}
+            page, by = (_page_of(request), _name_of(request)) if spec["job"] in MOVING else ("", "")
+            return {"id": self.runs.start(spec, page=page, by=by).id}
 
         return await _answer(start)
 
     async def _say(self, request: Request) -> Response:
-        asked = await _json(request)
+        """Order something, and answer what became of it."""
+        asked, started = await _json(request), time.monotonic()
 
-        def say() -> Mapping[str, Any]:
+        def say() -> tuple[Run, str]:
             runs = self.runs if request.url.path.startswith("/api/runs/") else self._looks
-            run, word, number = runs.one(request.path_params["name"]), str(asked.get("word"))[:20], asked.get("number")
+            run, word = runs.one(request.path_params["name"]), str(asked.get("word"))[:20]
+            more: dict[str, Any] = {}
             if word != "stop":  # everybody may stop a machine
-                self._check_word(run, word)
-                self._take_wheel(request)
-            run.say(word, **({"number": number} if isinstance(number, int) and abs(number) < 1 << 31 else {}))
-            return {}
+                self._check_word(run, word, asked)
+                run.lease.take(_page_of(request), _name_of(request))
+                more = {k: asked[k] for k in ("beat", "number", "goal") if _finite(asked.get(k))}
+                more["until"] = started + ANSWER_S
+            return run, run.say(word, by=_name_of(request), **more)
 
-        return await _answer(say)
+        try:
+            run, name = await run_in_threadpool(say)
+        except (AmbidError, OSError, UnicodeError) as refusal:
+            return _reply({"error": _words(refusal)}, 400)
+        answer = await _answered(run, name, stop=asked.get("word") == "stop")
+        if answer is None and asked.get("word") != "stop":
+            return _reply({"error": "not delivered: the run does not answer. It refuses the order if it wakes"}, 504)
+        if answer is not None and not answer.get("done"):
+            return _reply({"error": str(answer.get("why", ""))}, 409)
+        return _reply({"delivered": answer is not None})
 
-    def _check_word(self, run: Run, word: str) -> None:
+    async def _stop(self, request: Request) -> Response:
+        """Stop whatever moves, and answer whether it was told: nothing is waited for before the order is out."""
+        try:
+            moving = [r for r in self.runs.all()[:40] if r.alive and r.spec.get("job") in MOVING]
+            orders = [(run, run.say("stop", by=_name_of(request))) for run in moving]
+        except (AmbidError, OSError) as failure:
+            return _reply({"error": _words(failure)}, 500)
+        answers = await asyncio.gather(*(_answered(run, name, stop=True) for run, name in orders))
+        return _reply({"runs": [r.id for r in moving], "delivered": all(a is not None for a in answers)})
+
+    def _check_word(self, run: Run, word: str, asked: Mapping[str, Any]) -> None:
         """Refuse what is said to a run that it does not mean anything to."""
         job, of = str(run.spec.get("job"))[:20], [job for job, words in _WORDS.items() if word in words]
         if not of:
@@ -206,19 +231,24 @@ class Console:
             raise AmbidError(f"{word} is for a run of {of[0]}; this one is of {job}. Choose another run")
         if not run.alive:
             raise AmbidError(f"{word} does nothing: the run is over")
+        status = run.status
+        if not isinstance(status.get("at"), float) or time.monotonic() - status["at"] > _SILENT_S:
+            raise AmbidError(f"{word} does nothing: the run is silent. Stop, or use the emergency stop")
         if job == "live" and not run.follows:
             raise AmbidError(f"{word} does nothing: the run tracks nothing now. Wait until tracking has begun")
+        if not _finite(asked.get("beat")):
+            raise AmbidError(f"{word} does not say which state of the run it was given in. Reload the page")
 
     async def _drive(self, request: Request) -> Response:
-        self._driver = _client(request)
-        return _reply({})
+        """Take over the right to order a run."""
+        asked = await _json(request)
 
-    def _take_wheel(self, request: Request) -> None:
-        """Refuse what another page orders."""
-        if self._driver is None:
-            self._driver = _client(request)
-        if self._driver != _client(request):
-            raise AmbidError("another page has the machine. Take over first, or stop only")
+        def drive() -> Mapping[str, Any]:
+            run = self.runs.one(str(asked.get("run")))
+            run.lease.take(_page_of(request), _name_of(request), over=True)
+            return _holder(run, _page_of(request))
+
+        return await _answer(drive)
 
     def _spec(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Return what a run is told, from what a page asks for: files by number, nothing that is not known."""
@@ -268,45 +298,85 @@ class Console:
             await socket.close(1013)
             return
         self._viewers += 1
-        listening = None
+        listening, page = None, _plain(socket.query_params.get("page", ""))
         try:
             await socket.accept()
-            listening = asyncio.create_task(_until_gone(socket))
-            await self._send(socket, run, listening)
+            listening = asyncio.create_task(_until_gone(socket, run, page))
+            await self._send(socket, run, page, listening)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
             pass  # it is gone, or takes nothing
         finally:
             self._viewers -= 1
+            await run_in_threadpool(run.lease.drop, page)  # a page that is gone orders nothing any more
             if listening is not None:
                 listening.cancel()
             if socket.application_state == WebSocketState.CONNECTED:
                 with suppress(RuntimeError, TimeoutError):
                     await asyncio.wait_for(socket.close(), 1.0)
 
-    async def _send(self, socket: WebSocket, run: Run, listening: asyncio.Task[None]) -> None:
-        """Pass a feed on until its end; a viewer that is slow misses signals, not what was told."""
-        reader, looked, alive = FeedReader(run.place), 0.0, True
+    async def _send(self, socket: WebSocket, run: Run, page: str, listening: asyncio.Task[None]) -> None:
+        """Pass a feed on until its end; a viewer that is slow misses signals, not what was told. Who may order, and the
+        end where the disk took none, come from beside the feed.
+        """
+        reader, looked, alive, holder, ended = FeedReader(run.place), 0.0, True, None, False
+        moves = run.spec.get("job") in MOVING
         while not listening.done():
             data = reader.read()
-            if not data:
-                if not alive:
-                    break
-                if time.perf_counter() - looked > 0.5:
-                    looked, alive = time.perf_counter(), run.alive
-                await asyncio.sleep(_POLL_S)
-                continue
-            if reader.behind > _BACKLOG:
+            if data:
                 told = json_frames(data)
-                if told:
-                    await asyncio.wait_for(socket.send_text(json.dumps(told)), _PATIENCE_S)
-            else:
-                await asyncio.wait_for(socket.send_bytes(data), _PATIENCE_S)
+                ended = ended or any(m.get("kind") == "end" for m in told)
+                if reader.behind <= _BACKLOG:
+                    await _patiently(socket.send_bytes(data))
+                elif told:
+                    await _patiently(socket.send_text(json.dumps(told)))
+            elif not alive:
+                break
+            if (now := time.perf_counter()) - looked > _STATUS_S:
+                looked, alive, before = now, run.alive, holder
+                holder = _holder(run, page) if moves else None
+                if holder is not None and holder != before:
+                    await _patiently(socket.send_text(json.dumps([{"kind": "lease", **holder}])))
+            if not data:
+                await asyncio.sleep(_POLL_S)
+        end = run.status.get("end")
+        if not ended and isinstance(end, dict) and not listening.done():
+            await _patiently(socket.send_text(json.dumps([{**end, "kind": "end"}])))
 
 
-async def _until_gone(socket: WebSocket) -> None:
-    """Wait until a viewer goes; what it says is nothing to us."""
+async def _patiently(sending: Any) -> None:
+    await asyncio.wait_for(sending, _PATIENCE_S)
+
+
+async def _until_gone(socket: WebSocket, run: Run, page: str) -> None:
+    """Wait until a viewer goes; whatever it says is a sign of its life."""
+    last = 0.0
     while (await socket.receive())["type"] != "websocket.disconnect":
-        pass
+        if (now := time.monotonic()) - last > _SIGN_S:
+            last = now
+            await run_in_threadpool(run.lease.beat, page)
+
+
+async def _answered(run: Run, name: str, *, stop: bool) -> Mapping[str, Any] | None:
+    """Wait for the answer of a run to an order, of a `stop` also by another way; None where none comes."""
+    end = time.monotonic() + ANSWER_S + 0.1
+    while (answer := run.answer(name)) is None and time.monotonic() < end:
+        if stop and run.status.get("stopping") is True:
+            return {"done": True}
+        await asyncio.sleep(_ANSWER_POLL_S)
+    return answer
+
+
+def _holder(run: Run, page: str) -> dict[str, Any]:
+    """Return who may order a run: nobody, this page, or another by its name."""
+    has = run.lease.holder
+    return {"holder": str(has.get("name", ""))[:80], "you": bool(has) and has.get("page") == page}
+
+
+def _end(run: Run) -> Mapping[str, Any]:
+    """Return how a run ended, from its feed or, where the disk took none, from beside it."""
+    ends = [m for m in json_frames(FeedReader(run.place, parts=1).read(1 << 24)) if m.get("kind") == "end"]
+    beside = run.status.get("end")
+    return ends[-1] if ends else beside if isinstance(beside, dict) else {}
 
 
 def _about(run: Run) -> dict[str, Any]:
@@ -332,12 +402,18 @@ def _typed(name: str, value: Any, kind: Any) -> Any:
     return value
 
 
-def _client(request: Request) -> str:
-    return request.headers.get("x-ambid", "")[:64]
+def _plain(name: str) -> str:
+    return "".join(c for c in name[:32] if c.isascii() and (c.isalnum() or c == "-"))
 
 
-def _of(driver: str | None, request: Request) -> str:
-    return "nobody" if driver is None else "you" if driver == _client(request) else "another page"
+def _page_of(request: Request) -> str:
+    """Return which page asks: a number that it drew when it was loaded."""
+    return _plain(request.headers.get("x-ambid", ""))
+
+
+def _name_of(request: Request) -> str:
+    """Return what a page is called where another reads of it."""
+    return f"page {_page_of(request)[:6]} of the console at {request.url.netloc[:60]}"
 
 
 async def _json(request: Request) -> dict[str, Any]:
@@ -352,7 +428,15 @@ async def _answer(make: Callable[[], Mapping[str, Any]]) -> Response:
     try:
         return _reply(await run_in_threadpool(make))
     except (AmbidError, OSError, UnicodeError) as refusal:
-        return _reply({"error": str(refusal)}, 400)
+        return _reply({"error": _words(refusal)}, 400)
+
+
+def _words(failure: Exception) -> str:
+    """Return what went wrong; what the system says of a disk, in words."""
+    if not isinstance(failure, OSError):
+        return str(failure)
+    why = "the disk is full" if failure.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else failure.strerror
+    return f"nothing was done: the folder of the runs cannot be written: {why or failure}. Make room"
 
 
 def _reply(content: Mapping[str, Any], status: int = 200) -> Response:

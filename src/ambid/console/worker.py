@@ -6,6 +6,7 @@ acquires writes the journal of every acquisition.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -13,8 +14,9 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +25,14 @@ import numpy as np
 from ambid.console.envelope import EnvelopeTap, rounded, throttled
 from ambid.console.feed import FeedWriter
 from ambid.console.folder import plain
+from ambid.console.orders import LATE, Desk, Order
 from ambid.console.runs import Heard, Run
 from ambid.errors import AmbidError
 from ambid.estimation.result import NORMAL_95
-from ambid.record.calibration import INSIDE
+from ambid.record.record import INSIDE
 
 if TYPE_CHECKING:
+    from ambid.acquisition.session import Recording
     from ambid.ledger import History, Series
     from ambid.recursive.lines import Event
     from ambid.tracking.lines_file import LiveState
@@ -45,15 +49,17 @@ _MOST_ESTIMATES = 2000  # of a history, the latest, that are drawn
 class Worker:
     """One run at work."""
 
-    def __init__(self, run: Run) -> None:
-        self.run, self.spec = run, run.spec
-        self.feed = FeedWriter(run.place)
+    def __init__(self, run: Run, locks: Sequence[int] = ()) -> None:
+        self.run, self.spec, self._locks = run, run.spec, locks
+        for lock in locks:
+            os.set_inheritable(lock, False)
+        self.feed, self.desk = FeedWriter(run.place), Desk(run.place)
         self.folder = Path(self.spec["folder"])
         self.wished = threading.Event()  # the operator wants the end
-        self.flags: deque[str] = deque()
+        self.flags: deque[Order] = deque()
         self.cancelled = "cancelled before a result was there"
-        self._asked, self._follows = 0, False
-        self._answers: deque[str] = deque()
+        self._asked, self._asks, self._follows = 0, False, False
+        self._answers: deque[Order] = deque()
         self._began = time.perf_counter()
         self._progress = throttled(_LINE_S, self._tell_progress)
 
@@ -73,6 +79,9 @@ class Worker:
         except KeyboardInterrupt:
             self.end("cancelled", self.cancelled)
         except BaseException as defect:
+            if isinstance(defect, OSError) and defect.errno in (errno.ENOSPC, errno.EDQUOT):
+                self.end("refused", f"{defect.filename or self.folder} cannot be written: the disk is full. Make room")
+                return 0
             with suppress(OSError):  # of a full disk
                 traceback.print_exc()
             self.end("failed", f"a defect of the program: {type(defect).__name__}: {defect}. {self.run.place}/log.txt")
@@ -80,11 +89,15 @@ class Worker:
         finally:
             self.feed.close()
             self.run.release()
+            for lock in self._locks:  # this process takes a while to end
+                os.close(lock)
         return 0
 
     def end(self, how: str, why: str) -> None:
-        """Tell the end."""
-        self.feed.tell("end", {"how": how, "why": why, "wall": time.time()}, sticky="end")
+        """Tell the end, also on a full disk."""
+        said = {"how": how, "why": why, "wall": time.time()}
+        self.desk.note(end={**said, "why": why[:1000]})
+        self.feed.tell("end", said, sticky="end", last=True)
 
     def tick(self, stage: str, done: float | None = None, /) -> None:
         """Take progress of a job; a job that is to be cancelled is interrupted here, and keeps its best."""
@@ -107,19 +120,39 @@ class Worker:
     def follow(self, *, on: bool) -> None:
         """Tell whether a live bench is tracked from now on; only then do the words of `_FLAGS` mean something."""
         self._follows = on
-        self.run.follow(on=on)
+        self.desk.note(follows=on)
         self.feed.tell("following", {"on": on}, sticky="following")
 
     def agreed(self, what: str) -> bool:
         """Ask the operator, and wait for the answer."""
         self._asked += 1  # an answer to the question before is none
-        self._answers.clear()
+        self._asks = True
         self.feed.tell("ask", {"what": what, "number": self._asked}, sticky="ask")
-        while not self._answers and not self.wished.is_set():
+        word = ""
+        while not word and not self.wished.is_set():
             time.sleep(_LISTEN_S)
-        answer = self._answers.popleft() if self._answers else "no"
-        self.feed.tell("ask", {"what": "", "answer": answer}, sticky="ask")
-        return answer == "go"
+            while self._answers and not word:
+                order = self._answers.popleft()
+                word = order.word if self._obeys(order) else ""
+        self._asks = False
+        self.feed.tell("ask", {"what": "", "answer": word or "no"}, sticky="ask")
+        return word == "go"
+
+    def orders(self, goal: float | None) -> list[str]:
+        """Return what operators order of the tracker now; `goal`: time of the values that a revert would return to."""
+        taken = list[str]()
+        for _ in range(len(self.flags)):
+            order = self.flags.popleft()
+            moved = order.word == "revert" and order.goal is not None and order.goal != goal
+            if self._obeys(order, "what revert would return to has changed. Look again" if moved else ""):
+                taken.append(order.word)
+        return taken
+
+    def _obeys(self, order: Order, why: str = "") -> bool:
+        """Answer an order, and tell all pages; whether it is to be carried out, which `why` is against."""
+        why = LATE if self.desk.late(order) else why
+        self.feed.tell("order", self.desk.answer(order, why))
+        return not why
 
     def path(self, key: str) -> Path | None:
         """Return a file that the spec names; None where it names none."""
@@ -157,25 +190,34 @@ class Worker:
         self.feed.tell("progress", {"stage": stage, "done": done, "seconds": round(taken, 2)}, sticky="progress")
 
     def _listen(self) -> None:
-        heard, beat = Heard(self.run), 0.0
+        heard, beat, stopping = Heard(self.run), 0.0, False
         while True:
-            if time.perf_counter() - beat >= _BEAT_S:  # a frozen process falls silent, one that waits does not
-                beat = time.perf_counter()
-                self.feed.tell("beat", {})
-                if not self.run.place.exists():  # nobody can stop it from now on
-                    self.wished.set()
-            for said in heard:
-                word = said.get("word")
-                if word == "stop":
-                    self.wished.set()
+            with suppress(OSError):  # of a disk that is full or gone: orders are heard all the same
+                for said in heard:
+                    self._hear(Order.of(said))
+                if self.wished.is_set() and not stopping:  # by whatever way
+                    stopping = True
+                    self.desk.note(stopping=True)
                     self.feed.tell("stopping", {}, sticky="stopping")
-                elif word in _FLAGS and self._follows:
-                    self.flags.append(word)
-                elif word in _FLAGS:
-                    self.note(f"{word} came while nothing was tracked; it did nothing")
-                elif word in ("go", "no") and said.get("number") == self._asked:
-                    self._answers.append(word)
+                if time.perf_counter() - beat >= _BEAT_S:  # a frozen process falls silent, one that waits does not
+                    beat = time.perf_counter()
+                    self.feed.tell("beat", {"n": self.desk.beat()})
+                    if not self.run.place.exists():  # nobody can stop it from now on
+                        self.wished.set()
             time.sleep(_LISTEN_S)
+
+    def _hear(self, order: Order) -> None:
+        """Take an order: a stop at once and however old it is, others by whom they are for."""
+        if order.word == "stop":
+            self.wished.set()
+            self._obeys(replace(order, until=None, beat=None))
+        elif order.word in _FLAGS and self._follows:
+            self.flags.append(order)
+        elif order.word in ("go", "no") and self._asks and order.number == self._asked:
+            self._answers.append(order)
+        elif order.word in (*_FLAGS, "go", "no"):
+            asks = order.word in _FLAGS
+            self._obeys(order, "nothing is tracked now" if asks else "this question is no longer asked")
 
 
 def _preview(worker: Worker) -> None:
@@ -290,9 +332,10 @@ def _live(worker: Worker) -> None:
     )  # fmt: skip
     with opening as (device, course):
         view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
-        picture = EnvelopeTap(worker.feed, view)
         told = _Lines(worker)
-        with recording(device, rig, out, course, force=False, on_trouble=lambda e: worker.note(str(e))) as tap:
+        opening_record = recording(device, rig, out, course, on_trouble=lambda e: worker.note(str(e)))
+        with _storing(opening_record) as tap:
+            picture = EnvelopeTap(worker.feed, view, tap)
 
             def event(what: Any) -> None:
                 tap.tell(what)
@@ -306,8 +349,8 @@ def _live(worker: Worker) -> None:
                 made = track_live(
                     device, rig, course, start=known, taps=[tap, picture], on_event=event, on_run=runs.append,
                     on_trouble=trouble,
-                    on_header=told.header, on_line=told.line, on_lag=told.lag, keep=False, stopped=worker.stopped,
-                    every_s=0.02,
+                    on_header=told.header, on_line=told.line, on_lag=told.lag, keep=False, every_s=0.02,
+                    stopped=lambda: worker.stopped() or tap.failed is not None,  # a run that is not stored ends
                 )  # fmt: skip
                 worker.feed.tell("summary", _summary(made), sticky="summary")
             except AmbidError as refusal:
@@ -316,6 +359,7 @@ def _live(worker: Worker) -> None:
                 worker.note(str(refusal))
             finally:
                 worker.follow(on=False)
+        picture.end()
         done = tap.acquired(runs[0])
         fault = done.run.fault
         worker.feed.tell(
@@ -324,6 +368,21 @@ def _live(worker: Worker) -> None:
              "fault": None if fault is None else fault.what},
             sticky="recorded",
         )  # fmt: skip
+        if tap.failed is not None:
+            raise tap.failed
+
+
+@contextmanager
+def _storing(opening: AbstractContextManager[Recording]) -> Iterator[Recording]:
+    """Record; where the disk failed, that is the reason of the end, and what became of the record stands behind it."""
+    tap: Recording | None = None
+    try:
+        with opening as tap:
+            yield tap
+    except AmbidError as failure:
+        if tap is None or tap.failed is None:
+            raise
+        raise AmbidError(f"{tap.failed}. {failure}") from failure
 
 
 def _before_others() -> None:
@@ -372,12 +431,17 @@ class _Lines:
                 "line",
                 {"t": round(line.t, 4), "values": values, "error": _number(line.error), "state": line.state,
                  "lag_s": round(self._lag, 5), "updates": state.tally.updates,
-                 "rejected": state.tally.rejected_samples, "open": len(state.tally.open_changes)},
+                 "rejected": state.tally.rejected_samples, "open": len(state.tally.open_changes),
+                 "choices": {n: {"t": c.t, "values": _pairs(c.parameters)} for n, c in line.choices.items()}},
                 sticky="line",
             )  # fmt: skip
             self._lag = 0.0
-        flags = self._worker.flags
-        return [flags.popleft() for _ in range(len(flags))] if flags else None
+        revert = line.choices.get("revert")
+        return self._worker.orders(None if revert is None else revert.t) if self._worker.flags else None
+
+
+def _pairs(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    return {n: [_number(v.value), _number(v.sd)] for n, v in values.items()}
 
 
 def _told(event: Event) -> Mapping[str, Any]:
@@ -513,4 +577,4 @@ JOBS: Mapping[str, Callable[[Worker], None]] = {
 
 
 if __name__ == "__main__":
-    raise SystemExit(Worker(Run(Path(sys.argv[1]))).work())
+    raise SystemExit(Worker(Run(Path(sys.argv[1])), [int(fd) for fd in sys.argv[2:]]).work())

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
+INSIDE: list[Path] = []  # of this process: folders in one of which what is read has to lie; without any, anywhere
+
 
 def _tables(name: str) -> Any:
     """Return a function that turns tables into records, or back."""
@@ -387,6 +389,8 @@ def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "r
 @contextmanager
 def readable(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> Iterator[BinaryIO]:
     """Open a file that exists, is a file and can be read; arguments as `file_bytes`."""
+    if INSIDE and not any(path.resolve().is_relative_to(folder.resolve()) for folder in INSIDE):
+        raise error(f"{what} {path} is outside of {INSIDE[0]}. Copy it into that folder")
     try:
         with path.open("rb") as file:
             yield file

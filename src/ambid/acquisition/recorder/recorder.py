@@ -46,6 +46,7 @@ _EVENTS = 10_000  # that may wait
 _LOOK_S = 1.0  # how often the disk is looked at
 _HEADER_EVERY = 16 << 20  # bytes after which the header is written again: damage at the beginning costs no more
 _HEADER_AGAIN = 16 << 10  # the same at first, four times as many each time: no single bad sector hits every header
+_BEFORE_ALL = -(2**62)
 _NOTHING_LOST = "What is on the disk stays in the journal"
 
 
@@ -150,6 +151,7 @@ class JournalWriter:
         self._told: set[str] = set()
         self._fault: Exception | None = None
         self.acknowledged = 0
+        self.written = _BEFORE_ALL  # number of the sample after the last one that a kill of this process cannot undo
         self.lost_samples = 0  # taken from the queue and not written
         self.failed: DeviceError | None = None
 
@@ -233,6 +235,7 @@ class JournalWriter:
             try:
                 self._open.write(b"".join(frames))
                 self._unsynced = True
+                self.written = max([self.written, *(h.first + h.n_samples for h, _ in items if h.kind == BLOCK)])
             except OSError as failure:
                 self._broken(failure, items, frames, before)
         self._queue.written(samples)
@@ -399,6 +402,11 @@ class Recorder:
     def acknowledged(self) -> int:
         """Number of blocks that are on the disk, counted from the first one that was taken."""
         return self._writer.acknowledged
+
+    @property
+    def written(self) -> int:
+        """Number of the sample up to which the system has all that found room: a kill of this process loses none."""
+        return self._writer.written
 
     @property
     def blocks(self) -> int:

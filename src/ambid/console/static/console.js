@@ -2,7 +2,14 @@
 "use strict";
 
 const $ = (id) => document.getElementById(id);
-const CLIENT = sessionStorage.client ??= Array.from(crypto.getRandomValues(new Uint8Array(9)), (b) => b.toString(16).padStart(2, "0")).join("");
+const hex = (bytes) => Array.from(new Uint8Array(bytes), (b) => b.toString(16).padStart(2, "0")).join("");
+const PAGE = hex(crypto.getRandomValues(new Uint8Array(9)));  // of this load: a tab that is doubled is another page
+// The key of the session comes in the fragment of the first address, which no server is sent, and stays in the storage of this port.
+const brought = location.hash.match(/^#key=([\w-]+)$/)?.[1];
+if (brought) { localStorage.ambidKey = brought; history.replaceState(null, "", "/"); }
+const KEY = localStorage.ambidKey ?? "-", bytesOf = (text) => new TextEncoder().encode(text);
+const signer = crypto.subtle.importKey("raw", bytesOf(KEY), { name: "HMAC", hash: "SHA-256" }, false, ["sign"]);
+const proven = async (path) => `${path}?proof=${hex(await crypto.subtle.sign("HMAC", await signer, bytesOf(path)))}`;  // an address that the browser opens by itself
 const MOVING = ["live", "commission"], LATE_S = 0.2, SILENT_S = 1.5, START_S = 15, OLD_S = 2.0, SLOTS = 2000;
 let state = { files: [], runs: [] };
 
@@ -39,13 +46,13 @@ function shown(value, unit, sd) {
 const seconds = (s) => s < 1 ? `${(1000 * s).toFixed(s < 0.01 ? 1 : 0)} ms` : s < 120 ? `${s.toFixed(1)} s` : `${(s / 60).toFixed(1)} min`;
 
 // Asking the server.
-async function ask(path, body) {
+async function ask(path, body, patience) {
   const how = body === undefined ? {} : { method: "POST", body: JSON.stringify(body), headers: { "content-type": "application/json" } };
   let answer;
   try {
-    answer = await fetch(path, { ...how, headers: { ...how.headers, "x-ambid": CLIENT } });
+    answer = await fetch(path, { ...how, signal: patience && AbortSignal.timeout(patience), headers: { ...how.headers, "x-ambid": PAGE, "x-ambid-key": KEY } });
     gone = false;
-  } catch { gone = true; lookOld(); throw new Error("no answer"); }
+  } catch { gone = true; lookOld(); throw new Error("the console does not answer"); }
   const found = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : { error: (await answer.text()).trim() };
   if (!answer.ok) throw new Error(found.error ?? answer.statusText);
   return found;
@@ -55,29 +62,45 @@ function banner(text, kind = "") {
   const host = $("banner");
   if (host.dataset.text === text) return;
   host.dataset.text = text; host.className = kind; host.hidden = !text;
-  put(host, text, kind || feed?.over ? el("button", { onclick: () => { if (feed) feed.lost = false; banner(""); } }, "Close") : null);
+  put(host, text, kind || feed?.over ? el("button", { onclick: () => { if (feed) feed.brokeOff = false; banner(""); } }, "Close") : null);
 }
 // What is shown is not now: the console, the run's process, or the samples are silent. It outdoes every other banner.
 function lookOld() {
   const why = gone ? "the console does not answer. Runs go on; start 'ambid console' again" : feed?.old() ?? "";
   if (why) banner(`OLD: ${why}`);
   else if ($("banner").dataset.text?.startsWith("OLD: ")) banner("");
-  const not = refused(!(feed instanceof Live) ? "no live run is shown" : feed.over ? "the run is over" : !feed.following ? "nothing is tracked now" : why && "the run is silent");
-  for (const button of document.querySelectorAll("[data-say]")) { button.disabled = not !== ""; button.title = not && `Not now: ${not}`; }
-  if (feed?.asked) feed.pose();
-  for (const job of MOVING) $(`${job}-form`).hidden = !!feed && feed.job === job && feed.alive && !feed.over && !feed.lost;  // one run at a time
+  const run = feed && !feed.over && !feed.brokeOff ? feed : null;
+  const other = run?.holder && !run.you ? run.holder : "";
+  const not = state.read_only ? "this console is read only" : other ? `${other} has the right to order this run` : why && "what is shown is old";
+  const tracked = not || (!(feed instanceof Live) ? "no live run is shown" : !run ? "the run is over" : !feed.following ? "nothing is tracked now" : "");
+  for (const button of document.querySelectorAll("[data-say]")) { button.disabled = tracked !== ""; button.title = tracked && `Not now: ${tracked}`; }
+  if (question?.run) { question.old = question.run !== run ? "The run is over." : not && `Not now: ${not}.`; refuse(); }
+  put($("driver"), run && (other ? `${other} orders the run ` : run.you ? "this page orders the run" : "no page orders the run"), other && !state.read_only ? el("button", { onclick: takeOver }, "Take over") : null);
+  for (const job of MOVING) $(`${job}-form`).hidden = !!run && run.job === job && run.alive;  // one run at a time
 }
-const refused = (why) => state.read_only ? "this console is read only" : state.driver === "another page" ? "another page has the machine" : why || "";
 const trouble = (error) => banner(error.message, "note");
-function confirmed(question, yes = "Yes") {
-  const dialog = $("ask");
-  if (dialog.open) dialog.close("no");
-  $("question").textContent = question;
-  dialog.querySelector("[value=go]").textContent = yes;
-  dialog.returnValue = "no";
-  dialog.showModal();
-  return new Promise((done) => dialog.addEventListener("close", () => done(dialog.returnValue === "go"), { once: true }));
+
+// Questions: a panel beside what is shown. Nothing lies over Stop, and the page goes on.
+let question = null;  // the one that is open
+function pose(content, { yes = "Yes", run = null, focus = true } = {}) {  // whether it is agreed to; null: another question came
+  question?.end(null);
+  return new Promise((resolve) => {
+    const own = question = { run, old: "", not: "", draw: () => { put($("question"), ...content()); refuse(); }, end: (answer) => { if (question !== own) return; question = null; $("ask").hidden = true; document.body.classList.remove("asking"); resolve(answer); } };
+    $("yes").textContent = yes;
+    own.draw();
+    $("ask").hidden = false; document.body.classList.add("asking");
+    if (focus) $("no").focus({ preventScroll: true });
+    lookOld();
+  });
 }
+function refuse() {  // what cannot be agreed to now
+  const why = question.old || question.not;
+  $("yes").disabled = why !== ""; $("unasked").hidden = why === ""; $("unasked").textContent = why;
+}
+$("yes").onclick = () => question?.end(true);
+$("no").onclick = () => question?.end(false);
+const again = () => !question && feed?.asked && feed.pose(feed.asked);  // what another question had covered
+const confirmed = (text, yes, more = {}) => pose(() => [el("p", {}, text)], { yes, ...more });
 
 // Colours: as the machine has them, or as chosen; a cookie, since the port is another one each time.
 const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -89,13 +112,13 @@ function colours() {
 }
 
 // Tabs.
-function open(tab) {
+function show(tab) {
   for (const section of document.querySelectorAll(".tab")) section.hidden = section.id !== tab;
   for (const button of $("tabs").children) { button.ariaSelected = button.dataset.tab === tab; button.tabIndex = button.dataset.tab === tab ? 0 : -1; }
   location.hash = tab;
   dispatchEvent(new Event("resize"));
 }
-$("tabs").addEventListener("click", (e) => e.target.dataset.tab && open(e.target.dataset.tab));
+$("tabs").addEventListener("click", (e) => e.target.dataset.tab && show(e.target.dataset.tab));
 $("tabs").addEventListener("keydown", (e) => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
   if (!step) return;
@@ -107,8 +130,6 @@ $("tabs").addEventListener("keydown", (e) => {
 async function refresh() {
   state = await ask("/api/state");
   $("where").textContent = state.folder + (state.read_only ? " (read only)" : "") + (state.left_out ? `, ${state.left_out} older files not shown` : "");
-  const others = state.driver === "another page";
-  $("driver").replaceChildren(...(others ? ["another page has the machine ", el("button", { onclick: takeOver }, "Take over")] : state.driver === "you" ? ["this page has the machine"] : []));
   fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict, f.why]);
   fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
   for (const form of ["live-form", "commission-form"]) {
@@ -122,9 +143,10 @@ async function refresh() {
   $("history-hint").textContent = $("history-form").hidden ? "There is no ledger in this folder yet. 'ambid identify RECORD --ledger works.db' keeps each estimate in one; this page then shows what becomes of a bearing over months." : "";
   choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig"), "none");
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
-  $("stop").disabled = state.read_only || !state.runs.some((r) => r.alive && MOVING.includes(r.spec.job));
+  $("stop").disabled = state.read_only;
+  if (state.read_only) $("stop").title = "This console is read only: use the emergency stop";
   const moving = state.runs.find((r) => r.alive && MOVING.includes(r.spec.job));
-  if (moving && (feed?.id !== moving.id || feed.lost) && !attached.has(moving.id)) { attached.add(moving.id); watch(moving); }
+  if (moving && (feed?.id !== moving.id || feed.brokeOff) && !attached.has(moving.id)) { attached.add(moving.id); watch(moving); }
 }
 const attached = new Set();
 const when = (s) => { const d = new Date(1000 * s); return d.toDateString() === new Date().toDateString() ? d.toTimeString().slice(0, 8) : d.toISOString().slice(0, 10); };
@@ -166,7 +188,9 @@ function choices(select, files, none) {
   if ([...select.options].some((o) => o.value === before)) select.value = before;
 }
 async function takeOver() {
-  if (await confirmed("Another page orders the machine. Take over?", "Take over")) ask("/api/drive", {}).then(refresh).catch(trouble);
+  const run = feed;
+  if (await confirmed(`${run.holder} orders the run. Take over? It is told so.`, "Take over")) await ask("/api/drive", { run: run.id }).then((m) => run.leased(m)).catch(trouble);
+  again();
 }
 const stamp = () => new Date().toISOString().slice(0, 19).replace(/[-:]/g, "").replace("T", "-");
 const stem = (name) => name.split("/").pop().replace(/\.(csv|csv\.gz|h5|hdf5|mat|json|toml|html)$/i, "");
@@ -175,7 +199,7 @@ const WORDS = { usable: "Usable", caution: "Use with caution", unusable: "Do not
 
 function choose(file) {
   const detail = $("detail");
-  if (file.kind === "report") { window.open(`/reports/${file.number}`, "_blank", "noopener"); return; }
+  if (file.kind === "report") { proven(`/reports/${file.number}`).then((address) => window.open(address, "_blank", "noopener")); return; }
   detail.replaceChildren(el("h2", {}, file.name));
   detail.scrollIntoView();
   if (file.kind === "result") {
@@ -185,7 +209,7 @@ function choose(file) {
   } else if (file.kind === "ledger") {
     detail.append(el("p", { className: "hint" }, "A ledger: what became of bearings is shown under History."));
     $("history-form").elements.ledger.value = file.number;
-    put($("history-form").elements.bearing); open("history"); histories();
+    put($("history-form").elements.bearing); show("history"); histories();
   } else if (file.kind === "rig") {
     ask(`/api/rigs/${file.number}`).then((r) => detail.append(el("pre", {}, r.text))).catch(trouble);
   } else preview(file, detail);
@@ -195,10 +219,14 @@ function loopForm(file, detail) {
   const rigs = state.files.filter((f) => f.kind === "rig"), host = el("div");
   const rig = el("select", {}, ...rigs.map((f) => el("option", { value: f.number }, f.name)));
   const method = el("select", {}, el("option", { value: "pid" }, "PID, tuned"), el("option", { value: "lqg" }, "LQG"));
+  let under = false;
   const run = (name) => async () => {
+    if (under) return;
+    under = true;
     const spec = { job: name, estimate: file.number, rig: Number(rig.value), out: `${stem(file.name)}-${name}-${stamp()}` };
     host.replaceChildren();
     await job(name === "design" ? { ...spec, method: method.value } : spec, host, (m) => m.kind === "result" && results(m, host)).catch(wrong(host));
+    under = false;
   };
   detail.append(el("h2", {}, "Its loop"), el("div", { className: "bar" }, el("label", {}, "Rig with [loop] ", rig),
     el("button", { className: "go", disabled: state.read_only || !rigs.length, onclick: run("margins") }, "Margins"),
@@ -206,7 +234,11 @@ function loopForm(file, detail) {
     el("p", { className: "hint" }, "A design writes a rig with the new loop. The controller tries it where Live is started with it as 'Loop to try'."), host);
 }
 const drawn = (p) => el("figure", {}, el("img", { src: p.image, className: "drawn", alt: p.title }), el("figcaption", { className: "caption" }, p.caption));
-const link = (report) => el("p", {}, el("a", { href: `/reports/${report.number}`, target: "_blank", rel: "noopener" }, `Open ${report.name}`));
+function link(report) {
+  const anchor = el("a", { href: `/reports/${report.number}`, target: "_blank", rel: "noopener" }, `Open ${report.name}`);
+  proven(`/reports/${report.number}`).then((address) => { anchor.href = address; });
+  return el("p", {}, anchor);
+}
 
 // A job that computes: progress, cancel, and what it found.
 async function job(spec, host, told) {
@@ -309,12 +341,10 @@ function rigForm(m) {
 
 // Feeds: frames of a run, JSON ("J") and envelopes ("E").
 function listen(id, told, envelope = () => {}, gone = () => {}) {
-  let left = false;
-  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/runs/${id}/feed`);
-  const decoder = new TextDecoder();
-  let ended = false;
-  socket.binaryType = "arraybuffer";
-  socket.onmessage = ({ data }) => {
+  const decoder = new TextDecoder(), path = `/api/runs/${id}/feed`;
+  let socket = null, left = false, ended = false, sign = 0;
+  const hear = ({ data }) => {
+    if (performance.now() - sign > 500) { sign = performance.now(); socket.send("here"); }  // also in a tab behind others, whose timers rest
     if (typeof data === "string") { for (const m of JSON.parse(data)) { ended ||= m.kind === "end"; told(m); } return; }
     const view = new DataView(data);
     for (let at = 0; at + 5 <= data.byteLength;) {
@@ -324,8 +354,14 @@ function listen(id, told, envelope = () => {}, gone = () => {}) {
       at += 5 + length;
     }
   };
-  socket.onclose = () => { if (!ended && !left) { gone(); told({ kind: "end", how: "lost", why: "the run ended without a word, or the console is gone" }); } };
-  return { close() { left = true; socket.onmessage = null; socket.close(); } };
+  proven(path).then((address) => {
+    if (left) return;
+    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${address}&page=${PAGE}`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = hear;
+    socket.onclose = () => { if (!ended && !left) { gone(); told({ kind: "end", how: "lost", why: "the run ended without a word, or the console is gone" }); } };
+  });
+  return { close() { left = true; if (socket) { socket.onmessage = null; socket.close(); } } };
 }
 
 // Charts.
@@ -371,17 +407,29 @@ function strip(title, t, low, high, height = 110, unit = title.match(/\[(.*)\]/)
 
 // A run that is watched: it is silent where its process is frozen, also while it only waits.
 class Watched {
-  constructor(run) { Object.assign(this, { id: run.id, job: run.spec.job, alive: run.alive, last: performance.now(), began: false, over: false, lost: false, sampled: Infinity }); }
+  constructor(run) { Object.assign(this, { id: run.id, job: run.spec.job, alive: run.alive, last: performance.now(), began: false, over: false, brokeOff: false, sampled: Infinity, beat: null, holder: run.holder ?? "", you: run.you ?? false }); }
   listen() {
     this.socket = listen(this.id, (m) => {
       this.last = performance.now(); this.began = true;
-      if (m.kind === "end") { this.over = true; this.lost = this.alive && m.how === "lost"; if (this.lost) attached.delete(this.id); }
+      if (m.kind === "beat") this.beat = m.n;
+      if (m.kind === "lease") return this.leased(m);
+      if (m.kind === "stopping") delivered();
+      if (m.kind === "end") { this.over = true; this.brokeOff = this.alive && m.how === "lost"; if (this.brokeOff) attached.delete(this.id); }
       this.tell(m);
+      if (m.kind === "end") lookOld();
     }, (data, at) => this.envelope?.(data, at));
+  }
+  leased(m) {  // who may order
+    if (this.you && m.holder && !m.you) banner(`${m.holder} took over: it orders the run now`, "note");
+    this.holder = m.holder; this.you = m.you;
+    lookOld();
+  }
+  order(word, more = {}) {  // with the state that this page has seen last
+    return ask(`/api/runs/${this.id}/say`, { word, beat: this.beat, ...more }, 1500).catch((error) => trouble(new Error(`${word}: ${error.message}`)));
   }
   old() {
     const now = performance.now(), silent = (now - this.last) / 1000, dry = (now - this.sampled) / 1000;
-    if (this.lost) return "the run broke off. What is shown is not now";
+    if (this.brokeOff) return "the run broke off. What is shown is not now";
     if (!this.over && this.alive && silent > (this.began ? SILENT_S : START_S)) return `the run has been silent for ${silent.toFixed(0)} s, as if its process were frozen. What is shown is not now`;
     return !this.over && this.alive && dry > OLD_S ? `no sample came for ${dry.toFixed(0)} s. What is shown is not now` : "";
   }
@@ -412,7 +460,7 @@ class Live extends Watched {
   }
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; }, header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
-      event: () => { this.heard = true; this.event(m.t, m.what, m.why); }, told: () => this.before(m), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
+      event: () => { this.heard = true; this.event(m.t, m.what, m.why); }, told: () => this.before(m), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text), order: () => this.event(null, ...orderWords(m)),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
       summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
       recorded: () => { this.sampled = Infinity; this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
@@ -452,7 +500,7 @@ class Live extends Watched {
     if (this.t.length > most) { const cut = this.t.length - 100_000; this.t.splice(0, cut); for (const a of [...this.low, ...this.high]) a.splice(0, cut); }
     this.fresh = wall; this.last = performance.now(); this.dirty = true;
     this.sampled = end >= this.wanted - 0.1 ? Infinity : this.last;  // after the last sample none is missed
-    this.samples = Number(view.getBigUint64(at, true)) + n * group; this.lost = lost;
+    this.samples = Number(view.getBigUint64(at, true)) + n * group; this.lost = lost;  // samples that never came
   }
   start(m) {
     if (this.header) return;
@@ -474,6 +522,20 @@ class Live extends Watched {
     $("lag").textContent = `lag ${seconds(m.lag_s)}`; $("lag").className = m.lag_s > LATE_S ? "late" : "";
     put($("tally"), `${m.updates} updates, ${m.rejected} samples rejected`, m.open ? el("b", { className: "late" }, `, ${m.open} open change${m.open === 1 ? "" : "s"}`) : "");
     this.dirtyLines = true;
+    if (question?.run === this) question.draw();
+  }
+  // What an order would change: old and new values with their intervals, as they are now.
+  choice(word) {
+    const now = this.lines.at(-1), next = now?.choices[word], half = 1.96, value = (name, v) => shown(v?.[0], this.header.units[name], half * v?.[1]);
+    question.not = next ? "" : { accept: "A change was found but not its new value: there is nothing to accept.", revert: "There are no earlier values to return to." }[word];
+    return [el("h2", {}, { accept: "Accept the present estimate?", revert: `Go back to the values of ${next ? next.t.toFixed(2) : "?"} s?` }[word]),
+      el("p", { className: "hint" }, { accept: "It is in force at once, without waiting for later data. Revert undoes it.", revert: "Tracking then holds until you set it to track." }[word], " ± is the 95 % interval."),
+      next && el("table", {}, el("thead", {}, el("tr", {}, ...["", "in force", `after ${word}`].map((h) => el("th", {}, h)))),
+        el("tbody", {}, ...Object.entries(next.values).map(([name, v]) => el("tr", {}, el("td", {}, name), el("td", { className: "num" }, value(name, now.values[name])), el("td", { className: "num" }, value(name, v))))))].filter(Boolean);
+  }
+  async decide(word) {
+    const yes = { accept: "Accept", revert: "Revert" }[word];
+    if (await pose(() => this.choice(word), { yes, run: this })) this.order(word, word === "revert" ? { goal: this.lines.at(-1).choices.revert?.t } : {});
   }
   event(t, what, why) {
     $("events").prepend(el("li", { className: what === "change" || what === "fault" ? "refused" : "" }, `${t === null || t === undefined ? "" : `${t.toFixed(2)} s `}${what}: ${why}`));
@@ -587,15 +649,23 @@ function pick(values, a, z, step, of) {
   return found;
 }
 
+let starting = false;
 async function begin(form, spec) {
-  for (const [name, field] of Object.entries(Object.fromEntries([...form.elements].filter((f) => f.name).map((f) => [f.name, f])))) {
-    if (field.type === "checkbox") spec[name] = field.checked;
-    else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate", "arm"].includes(name) ? Number(field.value) : field.value;
-  }
-  const moves = spec.port !== "simulated" && !spec.port.startsWith("replay:");
-  if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
-  if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, and return to its own where the rotor moves too far. Load it?", "Load")) return;
-  try { const { id } = await ask("/api/runs", spec); banner(""); attached.add(id); await refresh(); watch({ id, spec, alive: true }); } catch (error) { trouble(error); }
+  if (starting) return;
+  starting = true;
+  try {
+    for (const [name, field] of Object.entries(Object.fromEntries([...form.elements].filter((f) => f.name).map((f) => [f.name, f])))) {
+      if (field.type === "checkbox") spec[name] = field.checked;
+      else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate", "arm"].includes(name) ? Number(field.value) : field.value;
+    }
+    const moves = spec.port !== "simulated" && !spec.port.startsWith("replay:");
+    if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
+    if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, and return to its own where the rotor moves too far. Load it?", "Load")) return;
+    const { id } = await ask("/api/runs", spec);
+    banner(""); attached.add(id);
+    await refresh();
+    watch({ id, spec, alive: true, you: true });
+  } catch (error) { trouble(error); } finally { starting = false; again(); }
 }
 $("live-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "live", pace: "real-time" }); });
 $("commission-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "commission" }); });
@@ -607,12 +677,12 @@ function watch(run) {
   if (!MOVING.includes(run.spec.job)) return past(run);
   feed?.socket?.close(); feed = null;
   feed = run.spec.job === "live" ? new Live(run) : new Steps(run);
-  open(run.spec.job); lookOld();
+  show(run.spec.job); lookOld();
 }
 function past(run) {
   const detail = $("detail"), host = el("div");
   detail.replaceChildren(el("h2", {}, `${run.spec.job} of ${run.spec.record ?? run.spec.estimate ?? run.spec.out ?? ""}`), host);
-  open("files");
+  show("files");
   let found = false;
   const socket = listen(run.id, (m) => {
     if (m.kind === "result") { found = true; results(m, host); }
@@ -620,9 +690,9 @@ function past(run) {
     else if (m.kind === "end") { if (!found || m.why) host.append(el("p", { className: m.how }, m.why || m.how)); socket.close(); }
   });
 }
-const word = (w) => feed instanceof Live && ask(`/api/runs/${feed.id}/say`, { word: w }).catch(trouble);
 for (const button of document.querySelectorAll("[data-say]")) {
-  button.onclick = async () => { if (!button.dataset.confirm || await confirmed(button.dataset.confirm)) word(button.dataset.say); };
+  const word = button.dataset.say;
+  button.onclick = () => ["accept", "revert"].includes(word) ? feed.decide(word) : feed.order(word);
 }
 function freeze(live, frozen) {
   live.frozen = frozen; live.zoom = null;
@@ -643,15 +713,45 @@ $("export").onclick = async () => {
   const [from_s, to_s] = feed.marked;
   await job({ job: "export", record: file.number, from_s, to_s, out: `${stem(file.name)}-${from_s.toFixed(2)}-${to_s.toFixed(2)}` }, host, (m) => m.kind === "exported" && feed.event(null, "exported", `${m.name}, ${m.samples} samples`)).catch(wrong(host));
 };
-async function stopAll() {
-  for (const run of state.runs.filter((r) => r.alive && MOVING.includes(r.spec.job))) ask(`/api/runs/${run.id}/say`, { word: "stop" }).catch(trouble);
+// Stop: of any page, at any time. It says that the run took it, or within a second that it did not.
+const DELIVERY_MS = 850;
+let stop = null;  // the one that is not delivered yet
+function delivery(text, kind) { $("delivery").textContent = text; $("delivery").className = kind; $("delivery").hidden = !text; }
+function delivered() {
+  if (!stop) return;
+  delivery(`Stop delivered after ${seconds((performance.now() - stop.began) / 1000)}: the run ends, the output goes off.`, "good");
+  clearTimeout(stop.timer); stop = null;
 }
-$("stop").onclick = stopAll;
-let escaped = 0;
+function stopAll() {
+  clearTimeout(stop?.timer);
+  const own = stop = { began: performance.now() };
+  const undelivered = (why) => { if (stop === own) delivery(`Stop NOT DELIVERED: use the emergency stop. ${why}; it is tried again.`, "bad"); };
+  delivery("Stop: on its way.", "note");
+  own.timer = setTimeout(() => undelivered("There is no answer"), DELIVERY_MS);
+  (async () => {
+    for (let tries = 0; tries < 120 && stop === own; tries++) {
+      try {
+        const answer = await ask("/api/stop", {}, DELIVERY_MS - 20);
+        if (stop !== own) return;
+        if (!answer.runs.length) { clearTimeout(own.timer); stop = null; return delivery("Nothing to stop: no run of this folder moves anything.", "note"); }
+        if (answer.delivered) return delivered();
+        undelivered("The run does not answer");
+      } catch (error) { undelivered(error.message[0].toUpperCase() + error.message.slice(1)); }
+      await new Promise((done) => setTimeout(done, 1000));
+    }
+  })();
+}
+$("stop").addEventListener("pointerdown", (e) => { if (e.button === 0) stopAll(); });
+$("stop").addEventListener("click", (e) => { if (e.detail === 0) stopAll(); });  // by a key
+let escaped = -Infinity;
 addEventListener("keydown", (e) => {
   if (e.ctrlKey && e.key === ".") stopAll();
-  if (e.key === "Escape") { if (performance.now() - escaped < 600) stopAll(); escaped = performance.now(); }
+  if (e.key !== "Escape" || e.repeat) return;
+  if ($("ask").contains(document.activeElement)) question?.end(false);
+  if (performance.now() - escaped < 600) stopAll();
+  escaped = performance.now();
 });
+const orderWords = (m) => [m.done ? "order" : "refused", `${m.word} at ${new Date(1000 * m.at).toTimeString().slice(0, 8)} by ${m.by || "this machine"}${m.done ? "" : `: ${m.why}`}`];
 
 // Commissioning.
 class Steps extends Watched {
@@ -669,7 +769,7 @@ class Steps extends Watched {
     const how = {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
       progress: () => this.at && !this.done.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
-      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), ask: () => this.question(m), stopping: () => this.at && this.note(this.at, "is being stopped"),
+      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), order: () => this.append(el("p", { className: m.done ? "hint" : "refused" }, orderWords(m).join(": "))), ask: () => this.question(m), stopping: () => this.at && this.note(this.at, "is being stopped"),
       commissioned: () => { this.kept = true; const words = m.passed ? "Commissioned." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, `Verdict: ${WORDS[m.verdict].toLowerCase()}`)); this.append(el("p", {}, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); $("steps").lastChild.scrollIntoView({ block: "end" }); }).catch(() => {}); },
       end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); const why = m.how === "cancelled" && this.kept ? `Stopped by the operator. The folder ${this.out} and its report keep what was found. To go on, start again with another folder: each step is done anew.` : m.why; if (why) this.append(el("p", { className: m.how, role: "alert" }, why)); refresh().catch(() => {}); },
     }[m.kind];
@@ -683,20 +783,15 @@ class Steps extends Watched {
       ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
       m.text ? el("details", {}, el("summary", {}, "table"), el("pre", {}, m.text)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
   }
-  question(m) {
+  question(m) {  // for who may answer; what was answered elsewhere meanwhile is not answered again
     this.asked = m.what && !this.over ? m : null;
-    if (!this.asked && this.posed) { this.posed = null; $("ask").close("no"); }
-    lookOld();
+    if (question?.run === this) question.end(null);
+    if (this.asked) this.pose(m);
   }
-  async pose() {  // to whom may answer; what was answered elsewhere meanwhile is not answered again
-    const m = this.asked, not = refused();
-    if (this.posed === m.number) return;
-    if (not) { this.append(el("p", { className: "hint" }, `It asks whether ${m.what} may begin; ${not}.`), "asks"); return; }
-    this.posed = m.number;
-    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go");
-    if (this.posed !== m.number) return;
-    this.asked = this.posed = null;
-    ask(`/api/runs/${this.id}/say`, { word: yes ? "go" : "no", number: m.number }).catch(trouble);
+  async pose(m) {
+    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go", { run: this, focus: false });
+    if (yes === null || this.asked !== m || this.over) return;
+    if (!await this.order(yes ? "go" : "no", { number: m.number })) again();
   }
 }
 
@@ -772,7 +867,7 @@ $("theme").value = document.cookie.match(/(?:^|; )ambid_colours=(light|dark)/)?.
 $("theme").onchange = () => { document.cookie = `ambid_colours=${$("theme").value}; SameSite=Strict; path=/; max-age=31536000`; colours(); };
 dark.addEventListener("change", colours);
 colours();
-if (["files", "live", "commission", "history"].includes(location.hash.slice(1))) open(location.hash.slice(1));
+if (["files", "live", "commission", "history"].includes(location.hash.slice(1))) show(location.hash.slice(1));
 refresh().catch(trouble);
 setInterval(() => { if (!document.hidden) refresh().catch(() => {}); }, 2000);
 setInterval(lookOld, 250);

@@ -1,0 +1,228 @@
+"""Stop in a browser: whatever is open, frozen, dead or full, it is clicked, and says whether the run took it."""
+
+import json
+import os
+import signal
+import time
+
+import pytest
+
+from ambid.console.runs import Runs
+from tests.console.browser import NEEDED, SIZES, chromium
+from tests.console.pages import console, prototype_rig, until
+
+pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
+pytestmark = NEEDED
+WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
+        "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
+DELIVERED_S, SAID_S = 0.3, 1.0
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def folder(tmp_path):
+    prototype_rig(tmp_path)
+    return tmp_path
+
+
+def number(run):
+    return json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
+
+
+def live(folder, name="run.h5", **more):
+    run = Runs(folder).start({**WISH, "out": name, **more})
+    assert until(run, "line")
+    return run
+
+
+def pressed(page, press):
+    """Press Stop; what the page says of it, and how long after the browser took the press, s."""
+    page.place("#stop")
+    page.evaluate(
+        """(() => { let began = null; window.said = null; const host = $("delivery");
+        for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, (e) => { began ??= e.timeStamp; }, true);
+        new MutationObserver(() => { if (["good", "bad"].includes(host.className)) said ??= [host.textContent,
+        (performance.now() - began) / 1000]; }).observe(host, { attributes: true, childList: true }); })()"""
+    )
+    press()
+    return page.until("window.said", 5.0)
+
+
+def over(run, seconds=20.0):
+    end = time.monotonic() + seconds
+    while run.alive and time.monotonic() < end:
+        time.sleep(0.02)
+    return not run.alive
+
+
+PRESSES = {
+    "mouse": lambda page: page.click("#stop"), "touch": lambda page: page.click("#stop", tap=True),
+    "ctrl and point": lambda page: page.key(".", ctrl=True),
+    "escape twice": lambda page: [page.key("Escape") for _ in range(2)],
+    "enter": lambda page: (page.evaluate("$('stop').focus()"), page.key("Enter")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("size", SIZES, ids=[f"{w}x{h}" for w, h in SIZES])
+def test_stop_is_clicked_beside_every_question(browser, folder, size):
+    run = live(folder)
+    with console(folder) as served:
+        page = browser.open(served.link, size)
+        page.until("feed?.following && feed.lines.length > 5")
+        page.click("[data-say=accept]")
+        page.until("!$('ask').hidden")
+        assert page.wide() == 0
+        page.click("[data-say=hold]")  # the page goes on beside the question
+        page.with_text("#events li", "order: hold")
+        assert "± " in page.text("#question table")
+        if size[0] < 800:
+            page.resize(*size, touch=True)
+        said, taken = pressed(page, lambda: page.click("#stop", tap=size[0] < 800))
+        assert said.startswith("Stop delivered after")
+        assert taken <= DELIVERED_S
+        assert over(run)
+        assert page.wrong == []
+        browser.close(page)
+
+
+@pytest.mark.parametrize("press", PRESSES)
+def test_stop_is_pressed_in_every_way_while_a_commissioning_asks(browser, folder, press):
+    run = Runs(folder).start({"job": "commission", "rig": "rig.toml", "port": "simulated", "seconds": 4.0, "out": "c"})
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.with_text("#question", "Next step: polarity")
+        page.evaluate("$('no').focus()")
+        said, taken = pressed(page, lambda: PRESSES[press](page))
+        assert said.startswith("Stop delivered after"), said
+        assert taken <= DELIVERED_S
+        assert over(run)
+        assert page.evaluate("$('ask').hidden")
+        assert [w for w in page.wrong if "409" not in w] == []  # the first of two Escapes says No, which came too late
+        browser.close(page)
+
+
+def test_stop_says_that_a_frozen_run_did_not_take_it_and_that_it_did_later(browser, folder):
+    run = live(folder)
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.until("feed?.following && feed.lines.length > 5")
+        os.kill(number(run), signal.SIGSTOP)
+        try:
+            said, taken = pressed(page, lambda: page.click("#stop"))
+            page.with_text("#banner", "OLD: the run has been silent")
+        finally:
+            os.kill(number(run), signal.SIGCONT)
+        assert "NOT DELIVERED: use the emergency stop" in said
+        assert taken <= SAID_S
+        page.with_text("#delivery", "Stop delivered after")
+        assert over(run)
+        browser.close(page)
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])
+def test_stop_says_that_a_server_does_not_answer(browser, folder, blow):
+    run = live(folder)
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.until("feed?.following && feed.lines.length > 5")
+        served.process.send_signal(blow)
+        said, taken = pressed(page, lambda: page.click("#stop"))
+        assert "NOT DELIVERED: use the emergency stop" in said
+        assert taken <= SAID_S
+        page.with_text("#banner", "OLD: the console does not answer")
+        browser.close(page)
+    run.say("stop")
+    assert over(run)
+
+
+def test_stop_is_delivered_where_the_disk_takes_no_order_and_samples_are_lost(browser, folder):
+    resource = pytest.importorskip("resource", reason="the system has no limits of a process")
+    run = live(folder)
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.until("feed?.following && feed.lines.length > 5")
+        page.evaluate(  # as envelopes of a run that lost seven samples are
+            "(() => { const show = feed.envelope.bind(feed); feed.envelope = (data, at) => { "
+            "new DataView(data).setBigUint64(at + 8, 7n, true); show(data, at); }; })()"
+        )
+        page.until("$('lost').textContent === '7 samples LOST'")
+        page.click("[data-say=hold]")  # a lost sample takes no control away
+        page.with_text("#events li", "order: hold")
+        resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (8192, 8192))  # the lease alone may be written
+        with (run.place / "control.jsonl").open("ab") as file:
+            file.write(b" " * 9000)
+        page.click("[data-say=track]")
+        page.with_text("#banner", "track: nothing was done: the folder of the runs cannot be written: the disk is full")
+        said, taken = pressed(page, lambda: page.click("#stop"))
+        assert said.startswith("Stop delivered after")
+        assert taken <= DELIVERED_S
+        assert over(run)
+        browser.close(page)
+
+
+def test_old_pages_order_nothing_and_a_run_that_wakes_refuses_what_waited(browser, folder):
+    run = live(folder)
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.until("feed?.following && feed.lines.length > 5")
+        page.click("[data-say=accept]")
+        os.kill(number(run), signal.SIGSTOP)
+        try:
+            beat = page.evaluate("feed.beat")
+            run.say("accept", beat=beat, until=time.monotonic() + 0.6)  # as a page that has not noticed yet
+            page.with_text("#banner", "OLD:")
+            assert page.evaluate("$('yes').disabled")
+            assert page.count("[data-say]:disabled") == 4
+        finally:
+            os.kill(number(run), signal.SIGCONT)
+        seen = until(run, "order")
+        assert [(m["word"], m["done"]) for m in seen if m["kind"] == "order"] == [("accept", False)]
+        page.with_text("#events li", "refused: accept")
+        page.until("!$('yes').disabled")
+        page.click("#yes")
+        page.with_text("#events li", "order: accept")
+        page.click("[data-say=revert]")
+        page.until("$('question').innerText.includes('after revert') && !$('yes').disabled")
+        page.click("#yes")
+        page.with_text("#events li", "reverted: by order of the operator")
+        said, _ = pressed(page, lambda: page.click("#stop"))
+        assert "delivered" in said
+        assert over(run)
+        assert page.wrong == []
+        browser.close(page)
+
+
+def test_two_pages_share_one_right_that_is_taken_over_told_and_given_back(browser, folder):
+    run = live(folder)
+    with console(folder) as one, console(folder) as two:
+        first, second = browser.open(one.link), browser.open(two.link)
+        for page in (first, second):
+            page.until("feed?.following && feed.lines.length > 5")
+        first.click("[data-say=hold]")
+        first.with_text("#driver", "this page orders the run")
+        second.with_text("#driver", f"of the console at {one.host} orders the run")
+        assert second.count("[data-say]:disabled") == 4
+        second.click("#driver button")
+        second.until("$('question').innerText.includes('Take over?')")
+        second.click("#yes")
+        first.with_text("#banner", f"of the console at {two.host} took over")
+        assert first.count("[data-say]:disabled") == 4
+        second.click("[data-say=track]")
+        first.with_text("#events li", "order: track")
+        browser.close(second)
+        began = time.monotonic()
+        first.with_text("#driver", "no page orders the run")
+        assert time.monotonic() - began < 4.0
+        first.click("[data-say=hold]")
+        first.with_text("#driver", "this page orders the run")
+        said, taken = pressed(first, lambda: first.click("#stop"))
+        assert said.startswith("Stop delivered")
+        assert taken <= DELIVERED_S
+        assert over(run)
+        assert first.wrong == []
+        browser.close(first)
