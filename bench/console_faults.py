@@ -1,6 +1,6 @@
 """What a console does when it is abused: starts at once, double clicks, kills, freezes, Stop; counted.
 
-``PYTHONPATH=. python bench/console_faults.py [TIMES]``. Benches are simulated; nothing is asserted.
+``PYTHONPATH=. python bench/console_faults.py [TIMES [NAME...]]``. Benches are simulated; nothing is asserted.
 """
 
 from __future__ import annotations
@@ -160,7 +160,10 @@ def stops(folder: Path, times: int) -> str:
 
 if __name__ == "__main__":
     number = int(sys.argv[1]) if sys.argv[1:] else 20
+    names = sys.argv[2:]  # of those that are wanted; without any, all
     for measure in (starts, clicks, kills, freezes, stops):
+        if names and measure.__name__ not in names:
+            continue
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as made:
             prototype_rig(Path(made))
             print(measure(Path(made), number), f"(load average {os.getloadavg()[0]:.1f})", flush=True)

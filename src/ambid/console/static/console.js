@@ -70,6 +70,7 @@ function lookOld() {
   if (why) banner(`OLD: ${why}`);
   else if ($("banner").dataset.text?.startsWith("OLD: ")) banner("");
   const run = feed && !feed.over && !feed.brokeOff ? feed : null;
+  run?.socket?.live();
   const other = run?.holder && !run.you ? run.holder : "";
   const not = state.read_only ? "this console is read only" : other ? `${other} has the right to order this run` : why && "what is shown is old";
   const tracked = not || (!(feed instanceof Live) ? "no live run is shown" : !run ? "the run is over" : !feed.following ? "nothing is tracked now" : "");
@@ -82,10 +83,10 @@ const trouble = (error) => banner(error.message, "note");
 
 // Questions: a panel beside what is shown. Nothing lies over Stop, and the page goes on.
 let question = null;  // the one that is open
-function pose(content, { yes = "Yes", run = null, focus = true } = {}) {  // whether it is agreed to; null: another question came
+function pose(content, { yes = "Yes", run = null, focus = true, closes = true } = {}) {  // whether it is agreed to; null: another question came
   question?.end(null);
   return new Promise((resolve) => {
-    const own = question = { run, old: "", not: "", draw: () => { put($("question"), ...content()); refuse(); }, end: (answer) => { if (question !== own) return; question = null; $("ask").hidden = true; document.body.classList.remove("asking"); resolve(answer); } };
+    const own = question = { run, closes, old: "", not: "", draw: () => { put($("question"), ...content()); refuse(); }, end: (answer) => { if (question !== own) return; question = null; $("ask").hidden = true; document.body.classList.remove("asking"); resolve(answer); } };
     $("yes").textContent = yes;
     own.draw();
     $("ask").hidden = false; document.body.classList.add("asking");
@@ -95,7 +96,8 @@ function pose(content, { yes = "Yes", run = null, focus = true } = {}) {  // whe
 }
 function refuse() {  // what cannot be agreed to now
   const why = question.old || question.not;
-  $("yes").disabled = why !== ""; $("unasked").hidden = why === ""; $("unasked").textContent = why;
+  $("yes").disabled = why !== ""; $("no").disabled = why !== "" && !question.closes;  // No to a run is an order too
+  $("unasked").hidden = why === ""; $("unasked").textContent = why;
 }
 $("yes").onclick = () => question?.end(true);
 $("no").onclick = () => question?.end(false);
@@ -343,8 +345,9 @@ function rigForm(m) {
 function listen(id, told, envelope = () => {}, gone = () => {}) {
   const decoder = new TextDecoder(), path = `/api/runs/${id}/feed`;
   let socket = null, left = false, ended = false, sign = 0;
+  const live = () => { if (socket?.readyState === 1 && performance.now() - sign > 500) { sign = performance.now(); socket.send("here"); } };
   const hear = ({ data }) => {
-    if (performance.now() - sign > 500) { sign = performance.now(); socket.send("here"); }  // also in a tab behind others, whose timers rest
+    live();  // also in a tab behind others, whose timers rest
     if (typeof data === "string") { for (const m of JSON.parse(data)) { ended ||= m.kind === "end"; told(m); } return; }
     const view = new DataView(data);
     for (let at = 0; at + 5 <= data.byteLength;) {
@@ -361,7 +364,7 @@ function listen(id, told, envelope = () => {}, gone = () => {}) {
     socket.onmessage = hear;
     socket.onclose = () => { if (!ended && !left) { gone(); told({ kind: "end", how: "lost", why: "the run ended without a word, or the console is gone" }); } };
   });
-  return { close() { left = true; if (socket) { socket.onmessage = null; socket.close(); } } };
+  return { live, close() { left = true; if (socket) { socket.onmessage = null; socket.close(); } } };
 }
 
 // Charts.
@@ -416,7 +419,7 @@ class Watched {
       if (m.kind === "stopping") delivered();
       if (m.kind === "end") { this.over = true; this.brokeOff = this.alive && m.how === "lost"; if (this.brokeOff) attached.delete(this.id); }
       this.tell(m);
-      if (m.kind === "end") lookOld();
+      if (m.kind === "end") { lookOld(); if (!this.brokeOff && $("delivery").className === "good") delivery($("delivery").textContent.replace(/:.*/, ": the run is over."), "good"); }
     }, (data, at) => this.envelope?.(data, at));
   }
   leased(m) {  // who may order
@@ -571,7 +574,7 @@ class Live extends Watched {
   redraw() { if (this.t.length) { this.drawStrips(...this.window()); if (this.lines.length) this.drawLines(...this.window()); } }
   draw() {
     if (feed !== this) return;
-    if (!this.frozen && !$("live").hidden) {
+    if (!this.frozen && !stop && !$("live").hidden) {  // nothing is drawn while a stop is on its way
       if (this.dirty) this.drawStrips(...this.window());
       if (this.dirtyLines) this.drawLines(...this.window());
       if (this.spectrum && this.lines4) this.drawSpectrum();
@@ -665,7 +668,7 @@ async function begin(form, spec) {
     banner(""); attached.add(id);
     await refresh();
     watch({ id, spec, alive: true, you: true });
-  } catch (error) { trouble(error); } finally { starting = false; again(); }
+  } catch (error) { trouble(error); refresh().catch(() => {}); } finally { starting = false; again(); }  // another run may have come first: it is shown
 }
 $("live-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "live", pace: "real-time" }); });
 $("commission-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "commission" }); });
@@ -747,7 +750,7 @@ let escaped = -Infinity;
 addEventListener("keydown", (e) => {
   if (e.ctrlKey && e.key === ".") stopAll();
   if (e.key !== "Escape" || e.repeat) return;
-  if ($("ask").contains(document.activeElement)) question?.end(false);
+  if (question?.closes) question.end(false);
   if (performance.now() - escaped < 600) stopAll();
   escaped = performance.now();
 });
@@ -769,7 +772,7 @@ class Steps extends Watched {
     const how = {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
       progress: () => this.at && !this.done.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
-      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), order: () => this.append(el("p", { className: m.done ? "hint" : "refused" }, orderWords(m).join(": "))), ask: () => this.question(m), stopping: () => this.at && this.note(this.at, "is being stopped"),
+      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), order: () => this.append(el("p", { className: m.done ? "hint" : "refused" }, orderWords(m).join(": "))), ask: () => this.question(m), stopping: () => this.at && !this.done.has(this.at) && this.note(this.at, "is being stopped"),
       commissioned: () => { this.kept = true; const words = m.passed ? "Commissioned." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, `Verdict: ${WORDS[m.verdict].toLowerCase()}`)); this.append(el("p", {}, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); $("steps").lastChild.scrollIntoView({ block: "end" }); }).catch(() => {}); },
       end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); const why = m.how === "cancelled" && this.kept ? `Stopped by the operator. The folder ${this.out} and its report keep what was found. To go on, start again with another folder: each step is done anew.` : m.why; if (why) this.append(el("p", { className: m.how, role: "alert" }, why)); refresh().catch(() => {}); },
     }[m.kind];
@@ -789,7 +792,7 @@ class Steps extends Watched {
     if (this.asked) this.pose(m);
   }
   async pose(m) {
-    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go", { run: this, focus: false });
+    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go", { run: this, focus: false, closes: false });
     if (yes === null || this.asked !== m || this.over) return;
     if (!await this.order(yes ? "go" : "no", { number: m.number })) again();
   }
