@@ -124,7 +124,10 @@ def freezes(folder: Path, times: int) -> str:
             os.kill(pid, signal.SIGCONT)
             frames = until(run)
             orders = [(m["word"], m["done"]) for m in frames if m["kind"] == "order"]
-            ended += orders == [("hold", False), ("stop", True)] and not (time.sleep(0.5) or run.alive)
+            late = time.monotonic() + 20.0
+            while run.alive and time.monotonic() < late:
+                time.sleep(0.01)
+            ended += orders == [("hold", False), ("stop", True)] and not run.alive
     return f"{times} freezes: not delivered {told}, within {slowest:.2f} s; on waking hold refused and stopped {ended}"
 
 
@@ -141,6 +144,7 @@ def stops(folder: Path, times: int) -> str:
             run = Runs(folder).start({**WISH, "out": f"stop-{k}.h5"})
             page.resize(width, height, touch=k % 3 == 1)
             page.reload()
+            until(run, "line")
             page.until(f"feed?.id === '{run.id}' && feed.following && feed.lines.length > 5", 60.0)
             page.click("[data-say=accept]")
             page.until("!$('ask').hidden")

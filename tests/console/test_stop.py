@@ -2,19 +2,21 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 
 import pytest
 
 from ambid.console.runs import Runs
+from ambid.job import acquire, identify
 from tests.console.browser import NEEDED, SIZES, chromium
 from tests.console.pages import console, prototype_rig, until
 
 pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 pytestmark = NEEDED
 WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
-        "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
+        "rig": "rig.toml", "estimate": "start.json", "pace": "real-time"}  # fmt: skip
 SAID_S = 1.0
 
 
@@ -24,9 +26,21 @@ def browser():
         yield started
 
 
+@pytest.fixture(scope="module")
+def estimate(tmp_path_factory):
+    """What tracking starts from at once; without one it takes the first five seconds."""
+    made = tmp_path_factory.mktemp("start")
+    prototype_rig(made)
+    words = {"seconds": 5.0, "excitation": "multisine", "amplitude": 1.4}
+    record = acquire("simulated", made / "rig.toml", made / "start.h5", **words).record
+    identify(record, made / "rig.toml").save(made / "start.json")
+    return made / "start.json"
+
+
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, estimate):
     prototype_rig(tmp_path)
+    shutil.copy(estimate, tmp_path)
     return tmp_path
 
 
@@ -190,7 +204,8 @@ def test_old_pages_order_nothing_and_a_run_that_wakes_refuses_what_waited(browse
         page.with_text("#events li", "refused: accept")
         page.until("!$('yes').disabled")
         page.click("#yes")
-        page.with_text("#events li", "order: accept")
+        page.with_text("#events li", "accepted: the present estimate")
+        page.until("(window.n ??= feed.lines.length) + 4 < feed.lines.length")
         page.click("[data-say=revert]")
         page.until("$('question').innerText.includes('after revert') && !$('yes').disabled")
         page.click("#yes")

@@ -122,6 +122,8 @@ class Worker:
         self._follows = on
         self.desk.note(follows=on)
         self.feed.tell("following", {"on": on}, sticky="following")
+        while not on and self.flags:
+            self._obeys(self.flags.popleft(), "tracking has ended")
 
     def agreed(self, what: str) -> bool:
         """Ask the operator, and wait for the answer."""
@@ -213,6 +215,8 @@ class Worker:
         if order.word == "stop":
             self.wished.set()
             self._obeys(replace(order, until=None, beat=None))
+        elif self.desk.late(order):
+            self._obeys(order)
         elif order.word in _FLAGS and self._follows:
             self.flags.append(order)
         elif order.word in ("go", "no") and self._asks and order.number == self._asked:
