@@ -73,6 +73,17 @@ def test_eight_starts_from_two_consoles_give_one_run_and_seven_refusals_by_name(
         assert told(until(run), "end")
 
 
+def test_a_run_that_another_console_begins_right_now_is_not_taken_for_over(tmp_path):
+    begun = Runs(tmp_path)
+    place = tmp_path / ".ambid" / "runs" / f"{int(time.time()):010d}-00000a"
+    place.mkdir(parents=True)
+    with console(tmp_path) as page:
+        assert [r["alive"] for r in page.open().state()["runs"]] == [False]
+        (place / "spec.json").write_text('{"job": "live"}', encoding="utf-8")
+        begun.one(place.name).claim()  # as its process does
+        assert [r["alive"] for r in page.state()["runs"]] == [True]
+
+
 def test_a_port_is_locked_for_all_folders_by_what_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     (tmp_path / "ttyX").touch()

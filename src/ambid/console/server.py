@@ -42,6 +42,7 @@ _LOOKS = ("preview", "history")  # jobs that change nothing
 _POLL_S = 0.02  # between two looks at a feed
 _ANSWER_POLL_S = 0.005  # between two looks for an answer
 _STATUS_S = 0.1  # between two looks of a viewer at lease and status
+_BEGINS_S = 60.0  # in which a run whose process is not there yet may still begin
 _SIGN_S = 0.4  # between two signs of life of a page that are kept
 _SILENT_S = 1.5  # without a sign of life: the process of a run is frozen
 _VIEWERS = 16  # feeds that are watched at once
@@ -157,7 +158,8 @@ class Console:
         end = _end(run)
         how, why = (str(end.get(k, ""))[:400] for k in ("how", "why")) if end else ("broke off", "")
         found = {**_about(run), "alive": False, "end": how[:20], "why": why}
-        self._over[run.id] = found
+        if end or time.time() - found["began"] > _BEGINS_S:
+            self._over[run.id] = found
         return found
 
     async def _rig_text(self, request: Request) -> Response:
