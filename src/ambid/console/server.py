@@ -320,12 +320,13 @@ class Console:
         """Pass a feed on until its end; a viewer that is slow misses signals, not what was told. Who may order, and the
         end where the disk took none, come from beside the feed.
         """
-        reader, looked, alive, holder, ended = FeedReader(run.place), 0.0, True, None, False
+        reader, looked, alive, holder = FeedReader(run.place), 0.0, True, None
+        begun = ended = False
         moves = run.spec.get("job") in MOVING
         while not listening.done():
             data = reader.read()
             if data:
-                told = json_frames(data)
+                begun, told = True, json_frames(data)
                 ended = ended or any(m.get("kind") == "end" for m in told)
                 if reader.behind <= _BACKLOG:
                     await _patiently(socket.send_bytes(data))
@@ -335,7 +336,7 @@ class Console:
                 break
             if (now := time.perf_counter()) - looked > _STATUS_S:
                 looked, alive, before = now, run.alive, holder
-                holder = _holder(run, page) if moves else None
+                holder = _holder(run, page) if moves and begun else None
                 if holder is not None and holder != before:
                     await _patiently(socket.send_text(json.dumps([{"kind": "lease", **holder}])))
             if not data:
