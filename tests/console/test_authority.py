@@ -1,5 +1,6 @@
 """One run has the machine and one page orders it; what a page was shown is kept; a full disk ends a run in words."""
 
+import errno
 import json
 import os
 import shutil
@@ -97,6 +98,19 @@ def test_a_port_is_locked_for_all_folders_by_what_it_is(tmp_path, monkeypatch):
     one.release()
     other.seize({})
     other.release()
+
+
+def test_a_start_that_fails_gives_the_machine_back(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "no space left")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ambid.console.slot._put", full)
+        with pytest.raises(OSError, match="no space left"):
+            Runs(tmp_path).start(WISH)
+    machine = Machine(tmp_path, "simulated")
+    machine.seize({})  # by another start, once there is room again
+    machine.release()
 
 
 def test_a_lease_is_kept_by_signs_of_life_told_by_name_and_given_back(tmp_path, monkeypatch):

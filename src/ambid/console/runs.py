@@ -145,11 +145,11 @@ class Runs:
             raise AmbidError("the folder .ambid is a link; runs are kept in the folder itself. Remove it")
         self._place.mkdir(parents=True, exist_ok=True)
         machine = Machine(self.folder, str(spec.get("port", ""))) if spec["job"] in MOVING else None
-        if machine is not None:
-            machine.seize({"job": spec["job"], "out": str(spec.get("out", ""))[:80], "by": by})
         try:
-            if machine is not None and any(r.alive and r.spec.get("job") in MOVING for r in self.all()):
-                raise AmbidError("a run that moves the machine is under way. Stop it first")
+            if machine is not None:
+                machine.seize({"job": spec["job"], "out": str(spec.get("out", ""))[:80], "by": by})
+                if any(r.alive and r.spec.get("job") in MOVING for r in self.all()):
+                    raise AmbidError("a run that moves the machine is under way. Stop it first")
             return self._begin(spec, machine, page, by)
         finally:
             if machine is not None:
@@ -183,7 +183,8 @@ class Runs:
         """Return all runs, the newest first."""
         for child in list(_CHILDREN):
             if child.poll() is not None:
-                _CHILDREN.remove(child)
+                with suppress(ValueError):  # another thread looked too
+                    _CHILDREN.remove(child)
         found = self._place.iterdir() if self._own and self._place.is_dir() else ()
         return [Run(p) for p in sorted(found, reverse=True) if _ID.fullmatch(p.name) and not p.is_symlink()]
 
