@@ -113,6 +113,29 @@ def test_a_start_that_fails_gives_the_machine_back(tmp_path, monkeypatch):
     machine.release()
 
 
+def test_stop_reaches_a_run_that_begins_and_one_behind_many_newer_ones(tmp_path):
+    prototype_rig(tmp_path)
+    (tmp_path / ".ambid" / "runs").mkdir(parents=True)
+    machine = Machine(tmp_path, "simulated")
+    with console(tmp_path) as page:
+        page.open()
+        assert page.json("POST", "/api/stop", {}) == {"runs": [], "delivered": True}
+        machine.seize({})
+        assert "a run has the bench and cannot be reached" in page.json("POST", "/api/stop", {})["error"]
+        with ThreadPoolExecutor(1) as clients:
+            stop = clients.submit(page.json, "POST", "/api/stop", {})
+            time.sleep(0.1)
+            run = Runs(tmp_path)._begin({**WISH, "out": "run.h5"}, machine, "", "")
+            machine.release()
+            assert stop.result()["runs"] == [run.id]
+        until(run, "begin")
+        for k in range(60):
+            (tmp_path / ".ambid" / "runs" / f"{9_000_000_000 + k}-000000").mkdir()
+        assert run.id in [r["id"] for r in page.state()["runs"] if r["alive"]]
+        assert page.json("POST", "/api/stop", {})["runs"] == [run.id]
+        assert told(until(run), "end")
+
+
 def test_a_lease_is_kept_by_signs_of_life_told_by_name_and_given_back(tmp_path, monkeypatch):
     monkeypatch.setattr("ambid.console.authority.LEASE_S", 0.1)
     lease = Lease(tmp_path)

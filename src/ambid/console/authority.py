@@ -60,6 +60,18 @@ def _fresh(content: Mapping[str, Any]) -> Mapping[str, Any]:
     return content if isinstance(at, float) and 0 <= time.monotonic() - at <= LEASE_S else {}
 
 
+def busy(folder: Path) -> bool:
+    """Whether a run has the bench of a folder, also one that only begins, or whose files another user keeps."""
+    try:
+        fd = opened(folder / ".ambid" / "bench.lock", os.O_RDWR)
+    except OSError as failure:
+        return not isinstance(failure, (FileNotFoundError, NotADirectoryError))
+    try:
+        return not locked(fd)
+    finally:
+        os.close(fd)
+
+
 class Machine:
     """What a run moves: the bench of a folder, and the serial port that it names, each locked for one run.
 

@@ -148,7 +148,7 @@ class Runs:
         try:
             if machine is not None:
                 machine.seize({"job": spec["job"], "out": str(spec.get("out", ""))[:80], "by": by})
-                if any(r.alive and r.spec.get("job") in MOVING for r in self.all()):
+                if self.moving():
                     raise AmbidError("a run that moves the machine is under way. Stop it first")
             return self._begin(spec, machine, page, by)
         finally:
@@ -187,6 +187,10 @@ class Runs:
                     _CHILDREN.remove(child)
         found = self._place.iterdir() if self._own and self._place.is_dir() else ()
         return [Run(p) for p in sorted(found, reverse=True) if _ID.fullmatch(p.name) and not p.is_symlink()]
+
+    def moving(self) -> list[Run]:
+        """Return the runs that may move the machine now."""
+        return [r for r in self.all() if r.alive and r.spec.get("job") in MOVING]
 
     def has(self, name: str) -> bool:
         """Whether there is a run of a name."""

@@ -29,6 +29,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from ambid.console.authority import busy
 from ambid.console.feed import FeedReader, json_frames
 from ambid.console.folder import Folder
 from ambid.console.guard import Guard
@@ -48,6 +49,7 @@ _SILENT_S = 1.5  # without a sign of life: the process of a run is frozen
 _VIEWERS = 16  # feeds that are watched at once
 _BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
 _PATIENCE_S = 20.0  # with a viewer that takes nothing
+_RUNS = 40  # that are listed, the newest, beside those that go on
 _CONNECTIONS = 48  # before those that ask nothing give way
 _HEAD_S = 15.0  # in which a connection has to say what it asks
 _REPORT_BYTES = 1 << 26
@@ -139,7 +141,9 @@ class Console:
     async def _state(self, request: Request) -> Response:
         entries = await run_in_threadpool(self.files.entries)
         page = _page_of(request)
-        runs = await run_in_threadpool(lambda: [self._about(r, page) for r in self.runs.all()[:40]])
+        runs = await run_in_threadpool(
+            lambda: [self._about(r, page) for k, r in enumerate(self.runs.all()) if k < _RUNS or r.alive]
+        )
         return _reply(
             {
                 "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
@@ -215,9 +219,17 @@ class Console:
         return _reply({"delivered": answer is not None})
 
     async def _stop(self, request: Request) -> Response:
-        """Stop whatever moves, and answer whether it was told: nothing is waited for before the order is out."""
+        """Stop whatever moves, and answer whether it was told: nothing is waited for before the order is out, but a run
+        that is about to begin.
+        """
+        end = time.monotonic() + ANSWER_S
         try:
-            moving = [r for r in self.runs.all()[:40] if r.alive and r.spec.get("job") in MOVING]
+            while not (moving := self.runs.moving()) and busy(self.files.path):
+                if time.monotonic() > end:
+                    return _reply(
+                        {"error": "a run has the bench and cannot be reached: it begins, or is another user's"}, 503
+                    )
+                await asyncio.sleep(_POLL_S)
             orders = [(run, run.say("stop", by=_name_of(request))) for run in moving]
         except (AmbidError, OSError) as failure:
             return _reply({"error": _words(failure)}, 500)
