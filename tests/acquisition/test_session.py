@@ -185,6 +185,13 @@ def test_a_tap_that_breaks_still_leaves_the_device_stopped():
     assert device.state == "idle"
 
 
+def test_a_stop_before_the_start_leaves_the_output_off():
+    device = ScriptedDevice()
+    report, _ = ran(device, stopped=lambda: True, settle_s=0.02, program=SQUARE)
+    assert report.interrupted
+    assert device.told == ["stop"]
+
+
 def test_a_refused_start_leaves_the_device_stopped():
     class Refuses(ScriptedDevice):
         def start(self, mode):

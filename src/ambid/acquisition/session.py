@@ -88,8 +88,10 @@ def run(
         state.forget()
         if course.transient and course.program is not None:
             device.load(course.program)
-        device.start(course.mode)
-        state.settle(stopped, passed_on=course.transient)
+        state.report.interrupted = stopped()  # while the device was opened: its output stays off
+        if state.going:
+            device.start(course.mode)
+            state.settle(stopped, passed_on=course.transient)
         if state.going and course.trial is not None:
             state.arm(course.trial, stopped)
         if state.going and course.program is not None:
