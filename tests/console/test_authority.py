@@ -1,5 +1,6 @@
 """One run has the machine and one page orders it; what a page was shown is kept; a full disk ends a run in words."""
 
+import asyncio
 import errno
 import json
 import os
@@ -8,6 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -23,8 +25,10 @@ from ambid.console.authority import Lease, Machine
 from ambid.console.envelope import EnvelopeTap
 from ambid.console.feed import FeedReader, FeedWriter, json_frames
 from ambid.console.orders import Desk, Order
-from ambid.console.runs import Runs
+from ambid.console.runs import Heard, Run, Runs
+from ambid.console.server import _answered
 from ambid.console.slot import Slot
+from ambid.console.worker import Worker
 from ambid.errors import AmbidError
 from ambid.record import read_record
 from ambid.tracking.blocks import Block, Frame
@@ -134,6 +138,49 @@ def test_stop_reaches_a_run_that_begins_and_one_behind_many_newer_ones(tmp_path)
         assert run.id in [r["id"] for r in page.state()["runs"] if r["alive"]]
         assert page.json("POST", "/api/stop", {})["runs"] == [run.id]
         assert told(until(run), "end")
+
+
+def test_a_run_that_was_told_to_stop_and_froze_is_not_said_to_have_taken_it_again(tmp_path):
+    run = Run(tmp_path)
+    desk = Desk(tmp_path)
+    desk.beat()
+    desk.note(stopping=True)
+    assert asyncio.run(_answered(run, "x", stop=True)) == {"done": True}
+    desk.note(at=time.monotonic() - 9.0)
+    assert asyncio.run(_answered(run, "x", stop=True)) is None
+
+
+def test_half_an_order_spoils_none_after_it(tmp_path, monkeypatch):
+    run, whole = Run(tmp_path), os.write
+    monkeypatch.setattr("os.write", lambda fd, data: whole(fd, data[:9]))
+    with pytest.raises(OSError, match="no space left"):
+        run.say("hold")
+    monkeypatch.undo()
+    run.say("stop")
+    assert [x["word"] for x in Heard(run)] == ["stop"]
+
+
+def test_a_run_that_could_hear_no_more_orders_ends(tmp_path, monkeypatch):
+    (tmp_path / "spec.json").write_text(json.dumps({"job": "rig", "folder": str(tmp_path)}), encoding="utf-8")
+    worker, run = Worker(Run(tmp_path)), Run(tmp_path)
+    monkeypatch.setattr(worker, "_hear", lambda order: order.missing)  # a defect
+    threading.Thread(target=worker._listen, daemon=True).start()
+    run.say("hold")
+    assert worker.wished.wait(5.0)
+    assert Order.of({"word": "hold", "by": "\ud800"}).by == "?"
+
+
+def test_an_answer_that_came_twice_answers_no_later_question(tmp_path):
+    (tmp_path / "spec.json").write_text(json.dumps({"job": "commission", "folder": str(tmp_path)}), encoding="utf-8")
+    worker = Worker(Run(tmp_path))
+    with ThreadPoolExecutor(1) as asking:
+        for number in (1, 2):
+            asked = asking.submit(worker.agreed, "on")
+            while not worker._asks:
+                time.sleep(0.001)
+            for word in ("go", "go") if number == 1 else ("no",):
+                worker._answers.append(Order(word=word, number=number))
+            assert asked.result(timeout=5.0) is (number == 1)
 
 
 def test_a_lease_is_kept_by_signs_of_life_told_by_name_and_given_back(tmp_path, monkeypatch):

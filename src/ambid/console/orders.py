@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
 import time
 from collections import deque
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from ambid.console.slot import Slot
+from ambid.console.slot import Slot, append
 
 FRESH_S = 2.0
 """Age of what a page has seen, s, from which on its orders are refused."""
@@ -43,7 +42,8 @@ class Order:
     @classmethod
     def of(cls, said: Mapping[str, Any]) -> Self:
         """Return what is written in a line; what is of another type than it has to be is left out."""
-        texts = {k: str(said[k])[:80] for k in ("word", "id", "by") if isinstance(said.get(k), str)}
+        raw = {k: said[k][:80] for k in ("word", "id", "by") if isinstance(said.get(k), str)}
+        texts = {k: x.encode("utf-8", "replace").decode() for k, x in raw.items()}  # so that it can be told
         numbers = {k: float(said[k]) for k in ("at", "until", "goal") if _is_number(said.get(k))}
         counts = {k: int(said[k]) for k in ("beat", "number") if _is_number(said.get(k))}
         return cls(**{"word": "", **texts}, **numbers, **counts)  # type: ignore[arg-type]
@@ -92,7 +92,7 @@ class Desk:
 
     def late(self, order: Order) -> bool:
         """Whether an order is of an older state than now, or has waited too long."""
-        since = next((at for n, at in self._beats if n == order.beat), None)
+        since = next((at for n, at in tuple(self._beats) if n == order.beat), None)  # another thread adds to them
         unseen = order.beat is not None and (since is None or time.monotonic() - since > FRESH_S)
         return order.expired or unseen
 
@@ -104,10 +104,5 @@ class Desk:
             self._answers.append(answer)
             self._write()
         with suppress(OSError):  # of a full disk
-            how = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-            fd = os.open(self._log, how, 0o600)
-            try:
-                os.write(fd, json.dumps(answer).encode() + b"\n")
-            finally:
-                os.close(fd)
+            append(self._log, json.dumps(answer))
         return answer

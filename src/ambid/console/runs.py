@@ -24,7 +24,7 @@ from typing import Any
 from ambid.console.authority import Lease, Machine
 from ambid.console.folder import open_plain
 from ambid.console.orders import Desk
-from ambid.console.slot import Slot
+from ambid.console.slot import Slot, append
 from ambid.errors import AmbidError
 
 MOVING = ("live", "commission")
@@ -76,13 +76,8 @@ class Run:
         """
         name = secrets.token_hex(6)
         line = json.dumps({"word": word, "id": name, "at": time.time(), **more})
-        how = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         try:
-            fd = os.open(self.place / "control.jsonl", how, 0o600)
-            try:
-                os.write(fd, (line + "\n").encode())
-            finally:
-                os.close(fd)
+            append(self.place / "control.jsonl", f"\n{line}")  # whole, also after half a line
         except OSError:
             if word != "stop" or not self.alive:
                 raise

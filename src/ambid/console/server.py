@@ -245,8 +245,7 @@ class Console:
             raise AmbidError(f"{word} is for a run of {of[0]}; this one is of {job}. Choose another run")
         if not run.alive:
             raise AmbidError(f"{word} does nothing: the run is over")
-        status = run.status
-        if not isinstance(status.get("at"), float) or time.monotonic() - status["at"] > _SILENT_S:
+        if _silent(run):
             raise AmbidError(f"{word} does nothing: the run is silent. Stop, or use the emergency stop")
         if job == "live" and not run.follows:
             raise AmbidError(f"{word} does nothing: the run tracks nothing now. Wait until tracking has begun")
@@ -375,10 +374,15 @@ async def _answered(run: Run, name: str, *, stop: bool) -> Mapping[str, Any] | N
     """Wait for the answer of a run to an order, of a `stop` also by another way; None where none comes."""
     end = time.monotonic() + ANSWER_S + 0.1
     while (answer := run.answer(name)) is None and time.monotonic() < end:
-        if stop and run.status.get("stopping") is True:
+        if stop and run.status.get("stopping") is True and not _silent(run):
             return {"done": True}
         await asyncio.sleep(_ANSWER_POLL_S)
     return answer
+
+
+def _silent(run: Run) -> bool:
+    at = run.status.get("at")
+    return not isinstance(at, float) or time.monotonic() - at > _SILENT_S
 
 
 def _holder(run: Run, page: str) -> dict[str, Any]:

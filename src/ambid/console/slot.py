@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import struct
@@ -100,6 +101,18 @@ def opened(path: Path, how: int) -> int:
         os.close(fd)
         raise OSError(f"{path.name} is no plain file")
     return fd
+
+
+def append(path: Path, line: str) -> None:
+    """Add a line to a file, which is made where there is none; one that does not fit raises `OSError`."""
+    how = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+    fd = os.open(path, how | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK")), 0o600)
+    try:
+        data = f"{line}\n".encode()
+        if os.write(fd, data) < len(data):
+            raise OSError(errno.ENOSPC, "no space left", path.name)
+    finally:
+        os.close(fd)
 
 
 def _content(fd: int) -> dict[str, Any]:

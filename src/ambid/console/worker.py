@@ -96,7 +96,7 @@ class Worker:
     def end(self, how: str, why: str) -> None:
         """Tell the end, also on a full disk."""
         said = {"how": how, "why": why, "wall": time.time()}
-        self.desk.note(end={**said, "why": why[:1000]})
+        self.desk.note(end={**said, "why": why[:400]})
         self.feed.tell("end", said, sticky="end", last=True)
 
     def tick(self, stage: str, done: float | None = None, /) -> None:
@@ -135,7 +135,8 @@ class Worker:
             time.sleep(_LISTEN_S)
             while self._answers and not word:
                 order = self._answers.popleft()
-                word = order.word if self._obeys(order) else ""
+                old = "" if order.number == self._asked else "this question is no longer asked"
+                word = order.word if self._obeys(order, old) else ""
         self._asks = False
         self.feed.tell("ask", {"what": "", "answer": word or "no"}, sticky="ask")
         return word == "go"
@@ -196,7 +197,7 @@ class Worker:
             _before_others()  # of this thread, which hardly works: a stop is taken at once
         heard, beat, stopping = Heard(self.run), 0.0, False
         while True:
-            with suppress(OSError):  # of a disk that is full or gone: orders are heard all the same
+            try:
                 for said in heard:
                     self._hear(Order.of(said))
                 if self.wished.is_set() and not stopping:  # by whatever way
@@ -208,6 +209,12 @@ class Worker:
                     self.feed.tell("beat", {"n": self.desk.beat()})
                     if not self.run.place.exists():  # nobody can stop it from now on
                         self.wished.set()
+            except OSError:  # of a disk that is full or gone: orders are heard all the same
+                pass
+            except Exception:  # a defect: nobody could stop it from now on
+                self.wished.set()
+                with suppress(OSError):
+                    traceback.print_exc()
             time.sleep(_LISTEN_S)
 
     def _hear(self, order: Order) -> None:
