@@ -150,6 +150,22 @@ def test_a_run_that_was_told_to_stop_and_froze_is_not_said_to_have_taken_it_agai
     assert asyncio.run(_answered(run, "x", stop=True)) is None
 
 
+def test_a_start_that_waited_in_a_frozen_console_is_refused_when_it_wakes(tmp_path):
+    prototype_rig(tmp_path)
+    with console(tmp_path) as page:
+        wish = {**WISH, "rig": page.open().number("rig.toml"), "out": "late", "now": page.state()["now"]}
+        page.process.send_signal(signal.SIGSTOP)
+        try:
+            with ThreadPoolExecutor(1) as clients:
+                start = clients.submit(page.json, "POST", "/api/runs", wish)
+                time.sleep(5.5)
+                page.process.send_signal(signal.SIGCONT)
+                assert "the start waited too long" in start.result()["error"]
+        finally:
+            page.process.send_signal(signal.SIGCONT)
+        assert Runs(tmp_path).all() == []
+
+
 def test_half_an_order_spoils_none_after_it(tmp_path, monkeypatch):
     run, whole = Run(tmp_path), os.write
     monkeypatch.setattr("os.write", lambda fd, data: whole(fd, data[:9]))

@@ -184,6 +184,40 @@ def test_stop_is_delivered_where_the_disk_takes_no_order_and_samples_are_lost(br
         browser.close(page)
 
 
+def test_stop_is_not_taken_for_delivered_by_what_an_old_run_tells_and_its_end_is_awaited(browser, folder):
+    old = live(folder, "old.h5")
+    old.say("stop")
+    assert over(old)
+    run = live(folder)
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.until("feed?.following && feed.lines.length > 5")
+        os.kill(number(run), signal.SIGSTOP)
+        try:
+            page.evaluate(f"stopAll(); watch(state.runs.find((r) => r.id === '{old.id}'))")
+            page.until("feed.over")
+            page.with_text("#delivery", "NOT DELIVERED: use the emergency stop")
+        finally:
+            os.kill(number(run), signal.SIGCONT)
+        assert over(run)
+        page.evaluate("refresh = async () => { state.runs = [{ alive: true, spec: { job: 'live' } }]; }")  # which hangs
+        page.evaluate("stop = { began: performance.now() }; delivered()")
+        page.with_text("#delivery", "has not ended yet. If the rotor still moves, use the emergency stop")
+        browser.close(page)
+
+
+def test_stop_while_a_run_is_about_to_begin_stops_it(browser, folder):
+    with console(folder) as served:
+        page = browser.open(served.link)
+        page.until("document.querySelector('#live-form [name=rig]').options.length > 0")
+        page.evaluate("document.querySelector('#live-form button.go').click(); stopAll()")
+        page.with_text("#delivery", "Stop delivered after")
+        (run,) = Runs(folder).all()
+        assert over(run)
+        assert not (folder / run.spec["out"]).exists()
+        browser.close(page)
+
+
 def test_old_pages_order_nothing_and_a_run_that_wakes_refuses_what_waited(browser, folder):
     run = live(folder)
     with console(folder) as served:

@@ -50,6 +50,7 @@ _VIEWERS = 16  # feeds that are watched at once
 _BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
 _PATIENCE_S = 20.0  # with a viewer that takes nothing
 _RUNS = 40  # that are listed, the newest, beside those that go on
+_START_S = 5.0  # how long one waits to be carried out
 _CONNECTIONS = 48  # before those that ask nothing give way
 _HEAD_S = 15.0  # in which a connection has to say what it asks
 _REPORT_BYTES = 1 << 26
@@ -180,9 +181,12 @@ class Console:
 
     async def _start(self, request: Request) -> Response:
         asked = await _json(request)
+        given = asked.pop("now", None)  # by the page's clock, which follows this one
 
         def start() -> Mapping[str, Any]:
             spec = self._spec(asked)
+            if spec["job"] in MOVING and _finite(given) and time.time() - given > _START_S:
+                raise AmbidError("the start waited too long, and nothing was done. Look at the bench, and start again")
             if spec["job"] in _LOOKS:
                 return {"id": self._looks.start(spec).id}
             if request.url.path != "/api/runs":

@@ -76,7 +76,8 @@ function lookOld() {
   const tracked = not || (!(feed instanceof Live) ? "no live run is shown" : !run ? "the run is over" : !feed.following ? "nothing is tracked now" : "");
   for (const button of document.querySelectorAll("[data-say]")) { button.disabled = tracked !== ""; button.title = tracked && `Not now: ${tracked}`; }
   if (question?.run) { question.old = question.run !== run ? "The run is over." : not && `Not now: ${not}.`; refuse(); }
-  put($("driver"), run && (other ? `${other} orders the run ` : run.you ? "this page orders the run" : "no page orders the run"), other && !state.read_only ? el("button", { onclick: takeOver }, "Take over") : null);
+  const driver = !run ? "" : other ? `${other} orders the run ` : run.you ? "this page orders the run" : "no page orders the run";
+  if ($("driver").firstChild?.textContent !== driver) put($("driver"), driver, other && !state.read_only ? el("button", { onclick: takeOver }, "Take over") : null);  // a button that is replaced cannot be clicked
   for (const job of MOVING) $(`${job}-form`).hidden = !!run && run.job === job && run.alive;  // one run at a time
 }
 const trouble = (error) => banner(error.message, "note");
@@ -130,7 +131,7 @@ $("tabs").addEventListener("keydown", (e) => {
 
 // Files and runs.
 async function refresh() {
-  state = await ask("/api/state");
+  state = { ...await ask("/api/state"), at: performance.now() };
   $("where").textContent = state.folder + (state.read_only ? " (read only)" : "") + (state.left_out ? `, ${state.left_out} older files not shown` : "");
   fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict, f.why]);
   fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
@@ -416,7 +417,7 @@ class Watched {
       this.last = performance.now(); this.began = true;
       if (m.kind === "beat") this.beat = m.n;
       if (m.kind === "lease") return this.leased(m);
-      if (m.kind === "stopping") delivered();
+      if (m.kind === "stopping" && this.alive) delivered();  // not of a run that is over and shown again
       if (m.kind === "end") { this.over = true; this.brokeOff = this.alive && m.how === "lost"; if (this.brokeOff) attached.delete(this.id); }
       this.tell(m);
       if (m.kind === "end") { lookOld(); if (!this.brokeOff && $("delivery").className === "good") delivery($("delivery").textContent.replace(/:.*/, ": the run is over."), "good"); }
@@ -664,7 +665,8 @@ async function begin(form, spec) {
     const moves = spec.port !== "simulated" && !spec.port.startsWith("replay:");
     if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
     if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, and return to its own where the rotor moves too far. Load it?", "Load")) return;
-    const { id } = await ask("/api/runs", spec);
+    const before = presses, { id } = await ask("/api/runs", { ...spec, now: state.now + (performance.now() - state.at) / 1000 });
+    if (presses !== before) stopAll();  // pressed while the run was about to begin
     banner(""); attached.add(id);
     await refresh();
     watch({ id, spec, alive: true, you: true });
@@ -717,26 +719,29 @@ $("export").onclick = async () => {
   await job({ job: "export", record: file.number, from_s, to_s, out: `${stem(file.name)}-${from_s.toFixed(2)}-${to_s.toFixed(2)}` }, host, (m) => m.kind === "exported" && feed.event(null, "exported", `${m.name}, ${m.samples} samples`)).catch(wrong(host));
 };
 // Stop: of any page, at any time. It says that the run took it, or within a second that it did not.
-const DELIVERY_MS = 850;
-let stop = null;  // the one that is not delivered yet
+const DELIVERY_MS = 850, ENDS_MS = 5000;
+let stop = null, presses = 0;  // `stop`: the one that is not delivered yet
 function delivery(text, kind) { $("delivery").textContent = text; $("delivery").className = kind; $("delivery").hidden = !text; }
 function delivered() {
   if (!stop) return;
   delivery(`Stop delivered after ${seconds((performance.now() - stop.began) / 1000)}: the run ends, the output goes off.`, "good");
   clearTimeout(stop.timer); stop = null;
+  const own = presses;
+  setTimeout(() => refresh().then(() => own === presses && state.runs.some((r) => r.alive && MOVING.includes(r.spec.job)) && delivery("The run took Stop, and has not ended yet. If the rotor still moves, use the emergency stop.", "bad")).catch(() => {}), ENDS_MS);
 }
 function stopAll() {
+  presses++;
   clearTimeout(stop?.timer);
   const own = stop = { began: performance.now() };
   const undelivered = (why) => { if (stop === own) delivery(`Stop NOT DELIVERED: use the emergency stop. ${why}; it is tried again.`, "bad"); };
   delivery("Stop: on its way.", "note");
   own.timer = setTimeout(() => undelivered("There is no answer"), DELIVERY_MS);
   (async () => {
-    for (let tries = 0; tries < 120 && stop === own; tries++) {
+    while (stop === own) {
       try {
         const answer = await ask("/api/stop", {}, DELIVERY_MS - 20);
         if (stop !== own) return;
-        if (!answer.runs.length) { clearTimeout(own.timer); stop = null; return delivery("Nothing to stop: no run of this folder moves anything.", "note"); }
+        if (!answer.runs.length) { clearTimeout(own.timer); stop = null; return delivery("Nothing to stop: no run of this folder moves anything. If something moves, use the emergency stop.", "note"); }
         if (answer.delivered) return delivered();
         undelivered("The run does not answer");
       } catch (error) { undelivered(error.message[0].toUpperCase() + error.message.slice(1)); }
