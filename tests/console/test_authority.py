@@ -21,6 +21,7 @@ import pytest
 
 pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 
+from ambid.console import runs
 from ambid.console.authority import Lease, Machine
 from ambid.console.envelope import EnvelopeTap
 from ambid.console.feed import FeedReader, FeedWriter, json_frames
@@ -112,6 +113,11 @@ def test_a_start_that_fails_gives_the_machine_back(tmp_path, monkeypatch):
         patched.setattr("ambid.console.slot._put", full)
         with pytest.raises(OSError, match="no space left"):
             Runs(tmp_path).start(WISH)
+    with monkeypatch.context() as patched:
+        patched.setattr("ambid.console.runs._write", lambda path, _: full() if path.name == "process.json" else None)
+        with pytest.raises(OSError, match="no space left"):
+            Runs(tmp_path).start(WISH)
+    assert runs._CHILDREN[-1].wait(timeout=10.0) == -signal.SIGKILL
     machine = Machine(tmp_path, "simulated")
     machine.seize({})  # by another start, once there is room again
     machine.release()

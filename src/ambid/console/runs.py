@@ -170,8 +170,12 @@ class Runs:
                 pass_fds=locks if os.name == "posix" else (),
                 cwd=place,  # never the folder: Python would run a numpy.py that is in it
             )  # fmt: skip
-        _write(place / "process.json", {"pid": process.pid, "began": process_began(process.pid)})
         _CHILDREN.append(process)
+        try:
+            _write(place / "process.json", {"pid": process.pid, "began": process_began(process.pid)})
+        except OSError:  # who is told that nothing began can rely on it
+            process.kill()
+            raise
         return run
 
     def all(self) -> list[Run]:

@@ -458,8 +458,9 @@ def _words(failure: Exception) -> str:
     """Return what went wrong; what the system says of a disk, in words."""
     if not isinstance(failure, OSError):
         return str(failure)
-    why = "the disk is full" if failure.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else failure.strerror
-    return f"nothing was done: the folder of the runs cannot be written: {why or failure}. Make room"
+    full = failure.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    why = "the disk is full. Make room" if full else f"{failure.strerror or failure}. Look at who may write to it"
+    return f"nothing was done: the folder of the runs cannot be written: {why}"
 
 
 def _reply(content: Mapping[str, Any], status: int = 200) -> Response:
