@@ -877,6 +877,7 @@ dark.addEventListener("change", colours);
 colours();
 if (["files", "live", "commission", "history"].includes(location.hash.slice(1))) show(location.hash.slice(1));
 refresh().catch(trouble);
-setInterval(() => { if (!document.hidden) refresh().catch(() => {}); }, 2000);
+let listing = false;  // one at a time: a browser asks six things of a server at once, and Stop does not queue behind them
+setInterval(() => { if (!document.hidden && !listing) { listing = true; refresh().catch(() => {}).finally(() => { listing = false; }); } }, 2000);
 setInterval(lookOld, 250);
 window.ambidConsole = { get feed() { return feed; } };  // for tests and the curious
