@@ -17,7 +17,6 @@ pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 pytestmark = NEEDED
 WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
         "rig": "rig.toml", "estimate": "start.json", "pace": "real-time"}  # fmt: skip
-SAID_S = 1.0
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +43,6 @@ def folder(tmp_path, estimate):
     return tmp_path
 
 
-def delivered_s():
-    """In which Stop is delivered; a machine that has more to do than its cores can takes that much longer."""
-    return min(0.85, 0.3 * max(1.0, os.getloadavg()[0] / os.cpu_count()))
-
-
 def number(run):
     return json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
 
@@ -60,13 +54,12 @@ def live(folder, name="run.h5", **more):
 
 
 def pressed(page, press):
-    """Press Stop; what the page says of it, and how long after the browser took the press, s."""
+    """Press Stop; what the page says first of what became of it. `bench/console_faults.py` measures how soon."""
     page.place("#stop")
     page.evaluate(
-        """(() => { let began = null; window.said = null; const host = $("delivery");
-        for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, (e) => { began ??= e.timeStamp; }, true);
-        new MutationObserver(() => { if (["good", "bad"].includes(host.className)) said ??= [host.textContent,
-        (performance.now() - began) / 1000]; }).observe(host, { attributes: true, childList: true }); })()"""
+        """(() => { window.said = null; const host = $("delivery");
+        new MutationObserver(() => { if (["good", "bad"].includes(host.className)) said ??= host.textContent; })
+        .observe(host, { attributes: true, childList: true }); })()"""
     )
     press()
     return page.until("window.said", 5.0)
@@ -101,9 +94,8 @@ def test_stop_is_clicked_beside_every_question(browser, folder, size):
         assert "± " in page.text("#question table")
         if size[0] < 800:
             page.resize(*size, touch=True)
-        said, taken = pressed(page, lambda: page.click("#stop", tap=size[0] < 800))
+        said = pressed(page, lambda: page.click("#stop", tap=size[0] < 800))
         assert said.startswith("Stop delivered after")
-        assert taken <= delivered_s()
         assert over(run)
         assert page.wrong == []
         browser.close(page)
@@ -116,9 +108,8 @@ def test_stop_is_pressed_in_every_way_while_a_commissioning_asks(browser, folder
         page = browser.open(served.link)
         page.with_text("#question", "Next step: polarity")
         page.evaluate("$('yes').focus()")
-        said, taken = pressed(page, lambda: PRESSES[press](page))
+        said = pressed(page, lambda: PRESSES[press](page))
         assert said.startswith("Stop delivered after"), said
-        assert taken <= delivered_s()
         assert over(run)
         assert page.evaluate("$('ask').hidden")
         assert page.wrong == []
@@ -132,12 +123,11 @@ def test_stop_says_that_a_frozen_run_did_not_take_it_and_that_it_did_later(brows
         page.until("feed?.following && feed.lines.length > 5")
         os.kill(number(run), signal.SIGSTOP)
         try:
-            said, taken = pressed(page, lambda: page.click("#stop"))
+            said = pressed(page, lambda: page.click("#stop"))
             page.with_text("#banner", "OLD: the run has been silent")
         finally:
             os.kill(number(run), signal.SIGCONT)
         assert "NOT DELIVERED: use the emergency stop" in said
-        assert taken <= SAID_S
         page.with_text("#delivery", "Stop delivered after")
         assert over(run)
         browser.close(page)
@@ -150,9 +140,8 @@ def test_stop_says_that_a_server_does_not_answer(browser, folder, blow):
         page = browser.open(served.link)
         page.until("feed?.following && feed.lines.length > 5")
         served.process.send_signal(blow)
-        said, taken = pressed(page, lambda: page.click("#stop"))
+        said = pressed(page, lambda: page.click("#stop"))
         assert "NOT DELIVERED: use the emergency stop" in said
-        assert taken <= SAID_S
         page.with_text("#banner", "OLD: the console does not answer")
         browser.close(page)
     run.say("stop")
@@ -177,9 +166,8 @@ def test_stop_is_delivered_where_the_disk_takes_no_order_and_samples_are_lost(br
             file.write(b" " * 9000)
         page.click("[data-say=track]")
         page.with_text("#banner", "track: nothing was done: the folder of the runs cannot be written: the disk is full")
-        said, taken = pressed(page, lambda: page.click("#stop"))
+        said = pressed(page, lambda: page.click("#stop"))
         assert said.startswith("Stop delivered after")
-        assert taken <= delivered_s()
         assert over(run)
         browser.close(page)
 
@@ -244,7 +232,7 @@ def test_old_pages_order_nothing_and_a_run_that_wakes_refuses_what_waited(browse
         page.until("$('question').innerText.includes('after revert') && !$('yes').disabled")
         page.click("#yes")
         page.with_text("#events li", "reverted: by order of the operator")
-        said, _ = pressed(page, lambda: page.click("#stop"))
+        said = pressed(page, lambda: page.click("#stop"))
         assert "delivered" in said
         assert over(run)
         assert page.wrong == []
@@ -274,9 +262,8 @@ def test_two_pages_share_one_right_that_is_taken_over_told_and_given_back(browse
         assert time.monotonic() - began < 4.0
         first.click("[data-say=hold]")
         first.with_text("#driver", "this page orders the run")
-        said, taken = pressed(first, lambda: first.click("#stop"))
+        said = pressed(first, lambda: first.click("#stop"))
         assert said.startswith("Stop delivered")
-        assert taken <= delivered_s()
         assert over(run)
         assert first.wrong == []
         browser.close(first)

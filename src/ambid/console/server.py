@@ -12,6 +12,7 @@ import math
 import re
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -96,6 +97,7 @@ class Console:
         self._beside = TemporaryDirectory(prefix="ambid-console-", ignore_cleanup_errors=True)
         self._looks = Runs(folder, Path(self._beside.name))  # previews: nothing of them stays
         self._viewers = 0
+        self._watching = Counter[tuple[str, str]]()  # feeds that a page watches, by run and page
         self._over: dict[str, dict[str, Any]] = {}  # runs that are over, as they are shown
         self.guard: Guard | None = None
 
@@ -234,10 +236,17 @@ class Console:
                         {"error": "a run has the bench and cannot be reached: it begins, or is another user's"}, 503
                     )
                 await asyncio.sleep(_POLL_S)
-            orders = [(run, run.say("stop", by=_name_of(request))) for run in moving]
         except (AmbidError, OSError) as failure:
             return _reply({"error": _words(failure)}, 500)
+        orders, failures = [], list[str]()
+        for run in moving:  # one that cannot be told keeps none from being told
+            try:
+                orders.append((run, run.say("stop", by=_name_of(request))))
+            except (AmbidError, OSError) as failure:
+                failures.append(_words(failure))
         answers = await asyncio.gather(*(_answered(run, name, stop=True) for run, name in orders))
+        if failures:
+            return _reply({"error": "; ".join(failures)}, 500)
         return _reply({"runs": [r.id for r in moving], "delivered": all(a is not None for a in answers)})
 
     def _check_word(self, run: Run, word: str, asked: Mapping[str, Any]) -> None:
@@ -316,6 +325,8 @@ class Console:
             return
         self._viewers += 1
         listening, page = None, _plain(socket.query_params.get("page", ""))
+        watched = (run.id, page)
+        self._watching[watched] += 1
         try:
             await socket.accept()
             listening = asyncio.create_task(_until_gone(socket, run, page))
@@ -324,7 +335,10 @@ class Console:
             pass  # it is gone, or takes nothing
         finally:
             self._viewers -= 1
-            await run_in_threadpool(run.lease.drop, page)  # a page that is gone orders nothing any more
+            self._watching[watched] -= 1
+            if not self._watching[watched]:  # a page that is gone orders nothing any more
+                del self._watching[watched]
+                await run_in_threadpool(run.lease.drop, page)
             if listening is not None:
                 listening.cancel()
             if socket.application_state == WebSocketState.CONNECTED:

@@ -731,6 +731,7 @@ function delivered() {
 }
 function stopAll() {
   presses++;
+  if (question && !question.run) question.end(false);  // what is not begun does not begin
   clearTimeout(stop?.timer);
   const own = stop = { began: performance.now() };
   const undelivered = (why) => { if (stop === own) delivery(`Stop NOT DELIVERED: use the emergency stop. ${why}; it is tried again.`, "bad"); };
