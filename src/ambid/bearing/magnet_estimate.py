@@ -95,7 +95,9 @@ def estimate_bearing(
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
         if "saturation" in extend:
             richer = _extended(fit, "saturation", parameters, short, linear, again)
-            fit = richer if _saturates(richer) and (white is None or white(richer)) else fit
+            same = richer.problem.law == fit.problem.law
+            sure = not same and richer.status != "failed" and _saturates(richer)
+            fit = richer if same or (sure and (white is None or white(richer))) else fit
         fit = rescue(
             fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
             lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
@@ -183,6 +185,8 @@ def _extended(
     law, values = replace(fit.problem.law, **more), dict(fit.problem.values(fit.vector))
     fresh = {n.name: n for n in start_numbers(law, parameters, records, linear)}
     new = [n for n in PARTS[part] if fresh[n].estimated]
+    if not new:  # a rig gives zero for all of it
+        return fit
     if "L_rise" in new:
         values |= {"L_leak": 0.7 * values["L_leak"], "L_rise": 0.4 * values["L_leak"]}
         fresh["L_rise"] = replace(fresh["L_rise"], value=values["L_rise"])
@@ -202,7 +206,7 @@ def _saturates(fit: BearingFit) -> bool:
     """Whether sigma is known to be above zero, by the scatter over stretches too."""
     spread = magnet_uncertainty(fit)
     sd = dict(zip(spread.names, np.sqrt(np.diag(spread.covariance(robust=True))), strict=True))
-    return fit.problem.law.saturation and fit.problem.values(fit.vector)["sigma"] > _PLAIN * sd.get("sigma", 0.0)
+    return bool(fit.problem.values(fit.vector)["sigma"] > _PLAIN * sd["sigma"])
 
 
 def _promises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:

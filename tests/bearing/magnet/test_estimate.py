@@ -58,6 +58,25 @@ def test_numbers_are_right_within_one_percent_and_within_their_deviations(bearin
     assert fit.problem.delays == {20_000.0: 1.0}
 
 
+def test_saturation_that_a_rig_gives_as_zero_is_not_looked_for(bearing):
+    zero = Parameter(name="sigma", unit="1/A^2", role="fixed", value=0.0)
+    records = [as_seen(d, str(n)) for n, d in enumerate(bearing[0])]
+    fit = estimate_bearing(records, KNOWN | {"sigma": zero}, laws=[PAIR], extend=("saturation",))
+    assert not fit.problem.law.saturation
+    assert fit.criterion == pytest.approx(bearing[2].criterion, abs=0.05)
+
+
+def test_a_search_without_a_predictor_is_refused_with_words_also_where_saturation_may_be_found(bearing, monkeypatch):
+    def failed(*a, **k):
+        return replace(search(*a, **k | {"iterations": 1}), status="failed", at=None)
+
+    monkeypatch.setattr(magnet_estimate, "search", failed)
+    monkeypatch.setattr(magnet_estimate, "rescue", lambda fit, *a, **k: fit)
+    records = [as_seen(d, str(n)) for n, d in enumerate(bearing[0])]
+    with pytest.raises(EstimationError, match="no start value makes a predictor"):
+        estimate_bearing(records, KNOWN, laws=[PAIR], extend=("saturation",))
+
+
 def test_linearised_values_are_right_at_every_operating_point(bearing):
     _, truth, fit = bearing
     x, i = (a.ravel() for a in np.meshgrid(np.linspace(-0.6, 0.6, 7) * truth["s"], np.linspace(-0.7, 0.7, 5)))
