@@ -265,3 +265,19 @@ def test_facts_of_a_record_are_compared_with_the_estimate():
     given = Parameter(name="v_offset", unit="V", value=far, role="prior", sd=0.1 * far)
     rig = replace(told, magnet=replace(told.magnet, parameters=(*told.magnet.parameters, given)))
     assert identify_nonlinear(moved, rig).checks.get("ohm") is None
+
+
+def test_facts_are_those_of_the_voltage_that_counts():
+    """A command beyond the limit never came to the coil: its mean tells nothing of R."""
+    _, told = ball()
+    record = package.simulate("levitated-ball", duration=1.0, seed=2, nonlinear=True)
+    x = record["voltage"].values
+    high = float(np.quantile(x, 0.99))
+    channels = (
+        replace(c, values=np.where(x >= high, 10.0 * x, x)) if c.name == "voltage" else c for c in record.channels
+    )
+    limits = Limits(voltage=(float(x.min()) - 1.0, high))
+    found = identify_nonlinear(replace(record, channels=tuple(channels)), replace(told, limits=limits))
+    assert any("beyond loop.limits.voltage" in w for w in found.warnings)
+    assert found.checks["ohm"].passed
+    assert found.checks["ohm"].values["value"] == pytest.approx(found["R"].value, rel=0.02)

@@ -247,7 +247,7 @@ def record_facts(
 ) -> tuple[dict[str, Check], Array]:
     """Compare what each record says by itself with the estimate, and return the worst of each check, and how far R and
     the offset of the voltage move where the means contradict them, (n_contradicting, n), SI. `benches`: channels by
-    role; `names`: of the records.
+    role; `names`: of the records. Of a record that was cut its longest part speaks, with the voltage that counts.
 
     A rig that gives an offset or a drop of the stage explains the means by it, and a stage that is off has none.
     """
@@ -259,7 +259,11 @@ def record_facts(
     moves = list[list[float]]()
     for record, bench, name in zip(fit.problem.records, benches, names, strict=True):
         roles = ("voltage", "current") if record.held else ("voltage", "current", "position")
-        checks = facts(replace(bench, channels=tuple(bench[role] for role in roles)), rig)
+        first, end = max(record.parts, key=lambda part: part[1] - part[0])
+        values_of = {role: record.u if role == "voltage" else bench[role].values for role in roles}
+        own = tuple(replace(bench[role], values=x[first:end]) for role, x in values_of.items())
+        bench = replace(bench, channels=own, start_s=bench.start_s + first / bench.rate_hz)
+        checks = facts(bench, rig)
         means = checks.pop("ohm").values
         if means and not explained and not np.any(record.loose > 0.0):
             checks["ohm"] = ohm(bench, values["R"], sd.get("R", 0.0), means["value"], means["sd"])
