@@ -26,6 +26,7 @@ def zone(peak, sd=0.0):
         (19.0, 0.5, "D", "D"),
         (9.5, 0.0, "A", "A"),
         (9.5, math.inf, "A to D", "D"),
+        (9.5, math.nan, "A to D", "D"),
     ],
 )
 def test_a_zone_is_a_letter_or_two_where_the_interval_holds_a_limit(peak, sd, letters, worst):
@@ -75,4 +76,4 @@ def test_the_measured_peak_counts_unless_the_predicted_one_is_surely_higher(pred
 def test_a_sensitivity_of_a_file_is_judged_as_a_new_one_also_of_an_earlier_version():
     entry = {"peak_db": {"value": 9.466, "sd": 0.037}, "zone": "A", "measured_peak_db": 9.496, "measured_sd_db": 0.08}
     assert Zone.read(entry) == Zone.of((9.466, 0.037), (9.496, 0.08))
-    assert Zone.read({"peak_db": {"value": 9.466, "sd": None}, "measured_peak_db": None}).letters == "A"
+    assert Zone.read({"peak_db": {"value": 9.466, "sd": None}, "measured_peak_db": None}).letters == "A to D"

@@ -31,11 +31,15 @@ def _zone_of_decibel(peak: float) -> str:
 
 class _Peak(NamedTuple):
     decibel: float
-    sd: float  # dB; 0: it is not known
+    sd: float  # dB; 0: nothing is said of it; inf: it is not known, nor is the zone
 
     @property
     def ends(self) -> tuple[float, float]:
         return self.decibel - NORMAL_95 * self.sd, self.decibel + NORMAL_95 * self.sd
+
+
+def _peak(decibel: float, sd: float) -> _Peak:
+    return _Peak(decibel, math.inf if math.isnan(sd) else sd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +55,7 @@ class Zone:
         """Judge the measured peak, (dB, sd), where there is one; the predicted one where it is surely higher (it may
         stand where nothing was excited) or where the measured one has no sd and is lower.
         """
-        p, m = _Peak(*predicted), None if measured is None else _Peak(*measured)
+        p, m = _peak(*predicted), None if measured is None else _peak(*measured)
         if m is None or p.ends[0] > m.ends[1] or (m.sd == 0.0 and p.ends[1] > m.decibel):
             return cls(peak_db=p.decibel, sd_db=p.sd, source="predicted")
         return cls(peak_db=m.decibel, sd_db=m.sd, source="measured")
@@ -61,7 +65,7 @@ class Zone:
         """Judge an axis of ``sensitivity`` as an estimate has it in JSON."""
         peak, measured = entry["peak_db"], entry["measured_peak_db"]
         pair = None if measured is None else _Peak(measured, entry.get("measured_sd_db") or 0.0)
-        return cls.of(_Peak(peak["value"], peak["sd"] or 0.0), pair)
+        return cls.of(_Peak(peak["value"], math.inf if peak["sd"] is None else peak["sd"]), pair)
 
     @property
     def upper_db(self) -> float:

@@ -79,7 +79,7 @@ def figure_text(name: str, x: float) -> str:
 
 
 def _zone_of(situation: Situation) -> str:
-    return max((s.rating for s in situation.sensitivity.values()), key=lambda z: z.peak_db).words
+    return max((s.rating for s in situation.sensitivity.values()), key=lambda z: z.upper_db).words
 
 
 def _figures(d: Design) -> Section:
