@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from ambid.control import margins
 from ambid.control.zones import Zone, zone_of
+from ambid.estimation.modes import EstimatedNumber
 
 LIMITS = [20.0 * math.log10(ratio) for ratio in (3.0, 4.0, 5.0)]
 
@@ -77,3 +79,21 @@ def test_a_sensitivity_of_a_file_is_judged_as_a_new_one_also_of_an_earlier_versi
     entry = {"peak_db": {"value": 9.466, "sd": 0.037}, "zone": "A", "measured_peak_db": 9.496, "measured_sd_db": 0.08}
     assert Zone.read(entry) == Zone.of((9.466, 0.037), (9.496, 0.08))
     assert Zone.read({"peak_db": {"value": 9.466, "sd": None}, "measured_peak_db": None}).letters == "A to D"
+
+
+@pytest.mark.parametrize(
+    ("peak", "sd", "passed", "text"),
+    [
+        (11.0, 0.2, True, "zone B (> 99 %) of ISO 14839-3"),
+        (11.9, 0.2, False, "too little margin for unrestricted operation is not ruled out. Add"),
+        (13.0, 0.2, False, "too little margin for unrestricted operation. Add"),
+    ],
+)
+def test_the_check_says_how_sure_a_lack_of_margin_is(peak, sd, passed, text):
+    number = EstimatedNumber.of(peak, sd, size=1.0)
+    axis = margins.AxisSensitivity(
+        peak_db=number, frequency_hz=40.0, zone=zone(peak, sd).letters, measured_peak_db=None
+    )
+    check = margins._zone({"x": axis})
+    assert check.passed == passed
+    assert text in check.detail
