@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 
@@ -217,10 +218,13 @@ def _left(y: Array, rows: Array) -> float:
     return float(rest @ rest)
 
 
-def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Check:
-    """Compare R with the means of a record, `mean` and its sd, ohm."""
+def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1) -> Check:
+    """Compare R with the means of a record, `mean` and its sd, ohm; one `of` several records: chance lets the farthest
+    of all pass as often as a single one.
+    """
     far = (R - mean) / float(np.hypot(sd, mean_sd))
-    passed = abs(far) <= _FAR
+    within = 2.0 * NormalDist().cdf(_FAR) - 1.0
+    passed = abs(far) <= NormalDist().inv_cdf(0.5 + 0.5 * within ** (1.0 / of))
     i0 = float(record["current"].values.mean())
     detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
     if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS:

@@ -266,7 +266,8 @@ def record_facts(
         checks = facts(bench, rig)
         means = checks.pop("ohm").values
         if means and not explained and not np.any(record.loose > 0.0):
-            checks["ohm"] = ohm(bench, values["R"], sd.get("R", 0.0), means["value"], means["sd"])
+            R, sd_R = values["R"], sd.get("R", 0.0)
+            checks["ohm"] = ohm(bench, R, sd_R, means["value"], means["sd"], of=len(names))
             shift = checks["ohm"].size or 0.0
             by = {"R": shift, "v_offset": -shift * float(bench["current"].values.mean())}
             moves += [[by.get(n, 0.0) for n in spread.names]] * (shift != 0.0)
