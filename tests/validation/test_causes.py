@@ -8,7 +8,8 @@ import pytest
 import ambid
 from ambid.bearing.linear import greybox
 from ambid.job.data import load_bench, signals_of
-from ambid.rig import default_rig
+from ambid.physics.presets import preset
+from ambid.rig import default_rig, rig_of_preset
 from ambid.validation.causes import causes, named_bias
 from tests.tiers import runs
 
@@ -20,8 +21,8 @@ def fitted(columns, rate_hz):
     return fit, {name: float(bench[name].values.mean()) for name in bench.names}
 
 
-def columns_of(preset, seed, duration=1.0):
-    record = ambid.simulate(preset, duration=duration, seed=seed)
+def columns_of(name, seed, duration=1.0):
+    record = ambid.simulate(rig_of_preset(preset(name)), duration=duration, seed=seed)
     return {c.name: c.values.copy() for c in record.channels}, record.rate_hz
 
 
@@ -35,8 +36,8 @@ def test_sound_records_name_no_cause():
     named = [
         c.name
         for seed in seeds
-        for preset in ("thesis", "unstable-bearing")
-        for c in strongest(*columns_of(preset, seed))
+        for name in ("thesis", "unstable-bearing")
+        for c in strongest(*columns_of(name, seed))
     ]
     assert len(named) <= max(1, len(seeds) // 20)
 
@@ -45,8 +46,8 @@ def test_probabilities_are_those_of_chance_on_sound_records():
     """Of all scores on sound records as many are below a probability as it says: none holds what is fed back."""
     chances = []
     for seed in range(1, 1 + runs(60, short=8)):
-        for preset in ("thesis", "unstable-bearing", "prototype"):
-            fit, means = fitted(*columns_of(preset, seed, 0.5))
+        for name in ("thesis", "unstable-bearing", "prototype"):
+            fit, means = fitted(*columns_of(name, seed, 0.5))
             chances += [c.p for c in causes(fit, means, thorough=False)]
     p = np.array(chances)
     n = p.size

@@ -264,6 +264,8 @@ def record_facts(
         own = tuple(replace(bench[role], values=x[first:end]) for role, x in values_of.items())
         bench = replace(bench, channels=own, start_s=bench.start_s + first / bench.rate_hz)
         checks = facts(bench, rig)
+        if record.held:  # a coil at rest stands still
+            del checks["log_runs"]
         means = checks.pop("ohm").values
         if means and not explained and not np.any(record.loose > 0.0):
             R, sd_R = values["R"], sd.get("R", 0.0)
