@@ -34,10 +34,7 @@ def strongest(columns, rate_hz):
 def test_sound_records_name_no_cause():
     seeds = range(1, 1 + runs(40, short=4))
     named = [
-        c.name
-        for seed in seeds
-        for name in ("thesis", "unstable-bearing")
-        for c in strongest(*columns_of(name, seed))
+        c.name for seed in seeds for name in ("thesis", "unstable-bearing") for c in strongest(*columns_of(name, seed))
     ]
     assert len(named) <= max(1, len(seeds) // 20)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -338,6 +338,7 @@ _ORDERS = (2, 6)  # of the polynomial, and at most half the lines
 _MISFIT = 4.0  # mean square of what a fit leaves, over the scatter, from which it is none
 _INNER = 0.5  # part of the fitted lines where the top is looked for: towards their ends a polynomial swings
 _SEEN = 0.1  # relative standard deviation of a peak that the record shows
+_DRAWS = 24  # of a fitted curve with noise
 _TOGETHER = 6  # lines on either side of one that may hide a peak, whose powers are averaged
 
 
@@ -368,7 +369,7 @@ class MeasuredSensitivity:
     def _found(self, measured: NDArray[np.bool_], noise: Array) -> tuple[float, float, float] | None:
         """Return the peak by the lines' relative noise, sought at the largest lower bound (the largest line is that of
         the largest noise). There a polynomial is fitted to 1/S, whose poles, plant's and controller's, are farther away
-        than those of S, and whose noise is circular, without bias.
+        than those of S, and whose noise is circular; that the top is sought on a noisy curve is taken off.
         """
         f = self.frequency_hz
         k = int(np.argmax(self.ratio * (1.0 - _BOUND * noise)))
@@ -382,13 +383,24 @@ class MeasuredSensitivity:
             S = self.ratio[near] * np.exp(1j * self.phase[near])
             top = _top(np.log(f[near] / f[k]), S, noise[near])
             if top is not None:
-                return top[0], float(f[k] * np.exp(top[1])), top[2]
+                height, sd = _as_if_known(top, np.log(f[near] / f[k]), noise[near])
+                return height, float(f[k] * np.exp(top.place)), sd
         return float(self.ratio[k]), float(f[k]), float(noise[k] * self.ratio[k])
 
 
-def _top(x: Array, S: Complex, noise: Array) -> tuple[float, float, float] | None:
-    """Return height, place and standard deviation of the top of |S| by a polynomial of 1/S of Akaike's order, None
-    where none fits; `noise`: relative standard deviation of |S|.
+class _Top(NamedTuple):
+    """The top of |S| by a polynomial of 1/S."""
+
+    height: float
+    place: float
+    sd: float
+    curve: Complex  # the polynomial at the lines, 1/S
+    misfit: float  # mean square of what it leaves, over the scatter
+
+
+def _top(x: Array, S: Complex, noise: Array) -> _Top | None:
+    """Return the top of |S| by a polynomial of 1/S of Akaike's order, None where none fits; `noise`: relative standard
+    deviation of |S|.
     """
     reach, weights = float(np.abs(x).max()), np.abs(S) / noise
     best: tuple[float, int, Any, Any, float] | None = None
@@ -407,7 +419,24 @@ def _top(x: Array, S: Complex, noise: Array) -> tuple[float, float, float] | Non
     size = np.abs(rows @ coefficients)
     k = int(np.argmin(size))
     sd = np.linalg.norm(np.linalg.solve(R.T, rows[k])) * np.sqrt(max(misfit, 1.0))
-    return float(1.0 / size[k]), float(at[k] * reach), float(sd / size[k] ** 2)
+    return _Top(
+        height=float(1.0 / size[k]), place=float(at[k] * reach), sd=float(sd / size[k] ** 2),
+        curve=np.polynomial.chebyshev.chebvander(x / reach, order) @ coefficients, misfit=max(misfit, 1.0),
+    )  # fmt: skip
+
+
+def _as_if_known(top: _Top, x: Array, noise: Array) -> tuple[float, float]:
+    """Return height and standard deviation of a top freed of what seeking it on a noisy curve adds: so much higher are
+    the tops of the curve with noise anew (parametric bootstrap, Efron and Tibshirani 1993, chap. 10).
+    """
+    rng = np.random.default_rng(0)
+    e = rng.standard_normal((2, _DRAWS, x.size)) * noise * np.abs(top.curve) * np.sqrt(top.misfit)
+    tops = [_top(x, 1.0 / (top.curve + one), noise) for one in e[0] + 1j * e[1]]
+    heights = np.array([t.height for t in tops if t is not None])
+    if heights.size < _DRAWS // 2:
+        return top.height, top.sd
+    bias = float(heights.mean()) - top.height
+    return top.height - bias, float(np.hypot(max(float(heights.std()), top.sd), bias))
 
 
 def measured_sensitivity(
