@@ -7,7 +7,6 @@ watches. Figures are printed; none is asserted.
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -30,7 +29,7 @@ from ambid.rig import write_rig
 from ambid.rig.draft import rig_of_preset
 from ambid.tracking.blocks import Block, Frame
 from tests.console.browser import CHROMIUM, chromium
-from tests.console.pages import Started, console, prototype_rig
+from tests.console.pages import Started, console, pid_of, prototype_rig
 from tracking_benches import RATE, preset_bench, record_of
 
 SIGNALS = 8
@@ -49,7 +48,7 @@ def main(seconds: float) -> None:
             print(f"command to page: {time.perf_counter() - before:.2f} s")
             wish = {"job": "live", "rig": page.number("rig.toml"), "port": "replay:played.h5", "seconds": seconds}
             run = Runs(folder).one(page.json("POST", "/api/runs", {**wish, "pace": "real-time", "out": "run"})["id"])
-            pid = json.loads((run.place / "process.json").read_text())["pid"]
+            pid = pid_of(run)
             watched("20 kHz, 3 strips, tracked", page, run, pid, seconds)
             words = [said for said in told_by(run) if said["kind"] in ("summary", "recorded")]
             for said in words:

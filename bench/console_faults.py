@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import struct
@@ -22,10 +21,8 @@ from ambid.console.feed import FeedReader
 from ambid.console.runs import Run, Runs
 from ambid.record import read_record
 from tests.console.browser import SIZES, Page, chromium
-from tests.console.pages import console, prototype_rig, until
+from tests.console.pages import LIVE, console, over, pid_of, prototype_rig, until
 
-WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
-        "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
 _PRESS = """(() => { let began = null; window.said = null; const host = $("delivery");
 for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, (e) => { began ??= e.timeStamp; }, true);
 new MutationObserver(() => { if (["good", "bad"].includes(host.className)) said ??= [host.className, Math.round(
@@ -34,10 +31,8 @@ performance.now() - began)]; }).observe(host, { attributes: true, childList: tru
 
 def end(run: Run) -> None:
     """Kill a run and wait until it is gone."""
-    pid = json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
-    os.kill(pid, signal.SIGKILL)
-    while run.alive:
-        time.sleep(0.01)
+    os.kill(pid_of(run), signal.SIGKILL)
+    over(run)
 
 
 def starts(folder: Path, times: int) -> str:
@@ -48,7 +43,7 @@ def starts(folder: Path, times: int) -> str:
         for n in range(times):
 
             def start(k: int, n: int = n) -> Any:
-                wish = {**WISH, "rig": rigs[k % 2], "out": f"start-{n}-{k}"}
+                wish = {**LIVE, "rig": rigs[k % 2], "out": f"start-{n}-{k}"}
                 return pages[k % 2].json("POST", "/api/runs", wish, headers={"X-Ambid": f"page-{k}"})
 
             answers = list(clients.map(start, range(8)))
@@ -90,7 +85,7 @@ def clicks(folder: Path, times: int) -> str:
 def kills(folder: Path, times: int) -> str:
     missing = 0
     for k in range(times):
-        run = Runs(folder).start({**WISH, "out": f"kill-{k}.h5"})
+        run = Runs(folder).start({**LIVE, "out": f"kill-{k}.h5"})
         until(run, "spectrum")
         time.sleep(0.0137 * k % 0.1)
         end(run)
@@ -113,9 +108,9 @@ def freezes(folder: Path, times: int) -> str:
     with console(folder) as served:
         page = served.open()
         for k in range(times):
-            run = Runs(folder).start({**WISH, "out": f"freeze-{k}.h5"})
+            run = Runs(folder).start({**LIVE, "out": f"freeze-{k}.h5"})
             until(run, "line")
-            pid = json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
+            pid = pid_of(run)
             os.kill(pid, signal.SIGSTOP)
             refused = page.say(run, "hold").get("error", "")
             began = time.monotonic()
@@ -141,7 +136,7 @@ def stops(folder: Path, times: int) -> str:
         page = browser.open(served.link)
         for k in range(times):
             width, height = SIZES[k % 4]
-            run = Runs(folder).start({**WISH, "out": f"stop-{k}.h5"})
+            run = Runs(folder).start({**LIVE, "out": f"stop-{k}.h5"})
             page.resize(width, height, touch=k % 3 == 1)
             page.reload()
             until(run, "line")

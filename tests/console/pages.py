@@ -14,6 +14,9 @@ from contextlib import contextmanager
 from tests.job.benches import PROTOTYPE_FILE
 
 PAGE = "page-1"
+LIVE = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
+        "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
+"""What a run that moves the simulated bench is told."""
 
 
 class Started:
@@ -98,6 +101,18 @@ def frames_of(feed):
 
 def told(frames, kind):
     return [m for m in frames if m["kind"] == kind]
+
+
+def pid_of(run):
+    return json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
+
+
+def over(run, seconds=20.0):
+    """Whether the process of a run ends within some seconds."""
+    end = time.monotonic() + seconds
+    while run.alive and time.monotonic() < end:
+        time.sleep(0.01)
+    return not run.alive
 
 
 def until(run, kind="end", seconds=120.0, of=None):

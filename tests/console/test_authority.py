@@ -33,28 +33,14 @@ from ambid.console.worker import Worker
 from ambid.errors import AmbidError
 from ambid.record import read_record
 from ambid.tracking.blocks import Block, Frame
-from tests.console.pages import Started, console, prototype_rig, told, until
-
-WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
-        "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
-
-
-def number(run):
-    return json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
-
-
-def over(run, seconds=30.0):
-    end = time.monotonic() + seconds
-    while run.alive and time.monotonic() < end:
-        time.sleep(0.01)
-    return not run.alive
+from tests.console.pages import LIVE, Started, console, over, pid_of, prototype_rig, told, until
 
 
 def test_eight_starts_from_two_consoles_give_one_run_and_seven_refusals_by_name(tmp_path):
     prototype_rig(tmp_path)
     with console(tmp_path) as one, console(tmp_path) as two, ThreadPoolExecutor(8) as clients:
         pages = [one.open(), two.open()]
-        wish = {**WISH, "rig": one.number("rig.toml")}
+        wish = {**LIVE, "rig": one.number("rig.toml")}
         two.number("rig.toml")
 
         def start(k):
@@ -71,7 +57,7 @@ def test_eight_starts_from_two_consoles_give_one_run_and_seven_refusals_by_name(
         run = Runs(tmp_path).one(started)
         assert [r.id for r in Runs(tmp_path).all()] == [started]
         until(run, "begin")
-        os.kill(number(run), signal.SIGKILL)  # its locks die with it
+        os.kill(pid_of(run), signal.SIGKILL)  # its locks die with it
         assert over(run)
         again = start(0)
         run = Runs(tmp_path).one(again["id"])
@@ -112,11 +98,11 @@ def test_a_start_that_fails_gives_the_machine_back(tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("ambid.console.slot._put", full)
         with pytest.raises(OSError, match="no space left"):
-            Runs(tmp_path).start(WISH)
+            Runs(tmp_path).start(LIVE)
     with monkeypatch.context() as patched:
         patched.setattr("ambid.console.runs._write", lambda path, _: full() if path.name == "process.json" else None)
         with pytest.raises(OSError, match="no space left"):
-            Runs(tmp_path).start(WISH)
+            Runs(tmp_path).start(LIVE)
     assert runs._CHILDREN[-1].wait(timeout=10.0) == -signal.SIGKILL
     machine = Machine(tmp_path, "simulated")
     machine.seize({})  # by another start, once there is room again
@@ -135,7 +121,7 @@ def test_stop_reaches_a_run_that_begins_and_one_behind_many_newer_ones(tmp_path)
         with ThreadPoolExecutor(1) as clients:
             stop = clients.submit(page.json, "POST", "/api/stop", {})
             time.sleep(0.1)
-            run = Runs(tmp_path)._begin({**WISH, "out": "run.h5"}, machine, "", "")
+            run = Runs(tmp_path)._begin({**LIVE, "out": "run.h5"}, machine, "", "")
             machine.release()
             assert stop.result()["runs"] == [run.id]
         until(run, "begin")
@@ -159,7 +145,7 @@ def test_a_run_that_was_told_to_stop_and_froze_is_not_said_to_have_taken_it_agai
 def test_a_start_that_waited_in_a_frozen_console_is_refused_when_it_wakes(tmp_path):
     prototype_rig(tmp_path)
     with console(tmp_path) as page:
-        wish = {**WISH, "rig": page.open().number("rig.toml"), "out": "late", "now": page.state()["now"]}
+        wish = {**LIVE, "rig": page.open().number("rig.toml"), "out": "late", "now": page.state()["now"]}
         page.process.send_signal(signal.SIGSTOP)
         try:
             with ThreadPoolExecutor(1) as clients:
@@ -305,10 +291,10 @@ def test_a_sample_is_shown_once_the_journal_has_it_and_lost_ones_are_counted(tmp
 def test_no_sample_that_was_shown_is_missing_after_a_kill(tmp_path):
     prototype_rig(tmp_path)
     for k in range(3):
-        run = Runs(tmp_path).start({**WISH, "out": f"run-{k}.h5"})
+        run = Runs(tmp_path).start({**LIVE, "out": f"run-{k}.h5"})
         assert until(run, "spectrum")
         time.sleep(0.013 * k)
-        os.kill(number(run), signal.SIGKILL)
+        os.kill(pid_of(run), signal.SIGKILL)
         assert over(run)
         first, n, _ = envelopes(run.place)[-1]
         words = [sys.executable, "-m", "ambid", "recover", tmp_path / f"run-{k}.h5.journal"]
@@ -348,7 +334,7 @@ def test_a_full_disk_ends_a_run_with_its_reason_and_takes_no_order_but_stop(tmp_
     (tmp_path / "rig.toml").rename(tmp_path / "disk.toml")
     with small_disk(folder) as (page, inside):
         page.open()
-        wish = {**WISH, "rig": page.number("rig.toml"), "seconds": 30.0}
+        wish = {**LIVE, "rig": page.number("rig.toml"), "seconds": 30.0}
         (run,) = [Runs(inside).one(page.json("POST", "/api/runs", {**wish, "out": "full"})["id"])]
         until(run, "header")
         fill(inside)
@@ -370,7 +356,7 @@ def test_a_full_disk_ends_a_run_with_its_reason_and_takes_no_order_but_stop(tmp_
 def test_a_full_disk_refuses_hold_in_words_and_lets_stop_through(tmp_path):
     resource = pytest.importorskip("resource", reason="the system has no limits of a process")
     prototype_rig(tmp_path)
-    run = Runs(tmp_path).start({**WISH, "out": "run.h5"})
+    run = Runs(tmp_path).start({**LIVE, "out": "run.h5"})
     until(run, "line")
     with console(tmp_path) as page:
         page.open()

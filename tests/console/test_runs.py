@@ -1,6 +1,5 @@
 """Runs of a console: jobs of one record, a live bench that no dying console disturbs, and who orders it."""
 
-import json
 import os
 import shutil
 import signal
@@ -23,7 +22,7 @@ from ambid.errors import AmbidError
 from ambid.job import load
 from ambid.record import read_record
 from ambid.rig import rig_from_text
-from tests.console.pages import console, frames_of, prototype_rig, told, until
+from tests.console.pages import console, frames_of, pid_of, prototype_rig, told, until
 from tests.tracking.tracks import track_of
 
 
@@ -120,7 +119,7 @@ def test_a_worker_that_dies_or_whose_folder_goes_is_told(tmp_path):
         killed = Runs(tmp_path).start({**wish, "out": "killed.h5"})
         until(killed, "spectrum")
         with page.feed(killed.id) as feed:
-            os.kill(json.loads((killed.place / "process.json").read_text(encoding="utf-8"))["pid"], signal.SIGKILL)
+            os.kill(pid_of(killed), signal.SIGKILL)
             seen = frames_of(feed)  # to its end
         assert told(seen, "spectrum")
         assert not told(seen, "end")

@@ -1,6 +1,5 @@
 """Stop in a browser: whatever is open, frozen, dead or full, it is clicked, and says whether the run took it."""
 
-import json
 import os
 import shutil
 import signal
@@ -11,12 +10,11 @@ import pytest
 from ambid.console.runs import Runs
 from ambid.job import acquire, identify
 from tests.console.browser import NEEDED, SIZES, chromium
-from tests.console.pages import console, prototype_rig, until
+from tests.console.pages import LIVE, console, over, pid_of, prototype_rig, until
 
 pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 pytestmark = NEEDED
-WISH = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
-        "rig": "rig.toml", "estimate": "start.json", "pace": "real-time"}  # fmt: skip
+WISH = {**LIVE, "estimate": "start.json"}
 
 
 @pytest.fixture(scope="module")
@@ -43,14 +41,17 @@ def folder(tmp_path, estimate):
     return tmp_path
 
 
-def number(run):
-    return json.loads((run.place / "process.json").read_text(encoding="utf-8"))["pid"]
-
-
 def live(folder, name="run.h5", **more):
     run = Runs(folder).start({**WISH, "out": name, **more})
     assert until(run, "line")
     return run
+
+
+def following(browser, link, *size):
+    """A page that shows a run that tracks."""
+    page = browser.open(link, *size)
+    page.until("feed?.following && feed.lines.length > 5")
+    return page
 
 
 def pressed(page, press):
@@ -65,13 +66,6 @@ def pressed(page, press):
     return page.until("window.said", 5.0)
 
 
-def over(run, seconds=20.0):
-    end = time.monotonic() + seconds
-    while run.alive and time.monotonic() < end:
-        time.sleep(0.02)
-    return not run.alive
-
-
 PRESSES = {
     "mouse": lambda page: page.click("#stop"), "touch": lambda page: page.click("#stop", tap=True),
     "ctrl and point": lambda page: page.key(".", ctrl=True),
@@ -84,8 +78,7 @@ PRESSES = {
 def test_stop_is_clicked_beside_every_question(browser, folder, size):
     run = live(folder)
     with console(folder) as served:
-        page = browser.open(served.link, size)
-        page.until("feed?.following && feed.lines.length > 5")
+        page = following(browser, served.link, size)
         page.click("[data-say=accept]")
         page.until("!$('ask').hidden")
         assert page.wide() == 0
@@ -119,14 +112,13 @@ def test_stop_is_pressed_in_every_way_while_a_commissioning_asks(browser, folder
 def test_stop_says_that_a_frozen_run_did_not_take_it_and_that_it_did_later(browser, folder):
     run = live(folder)
     with console(folder) as served:
-        page = browser.open(served.link)
-        page.until("feed?.following && feed.lines.length > 5")
-        os.kill(number(run), signal.SIGSTOP)
+        page = following(browser, served.link)
+        os.kill(pid_of(run), signal.SIGSTOP)
         try:
             said = pressed(page, lambda: page.click("#stop"))
             page.with_text("#banner", "OLD: the run has been silent")
         finally:
-            os.kill(number(run), signal.SIGCONT)
+            os.kill(pid_of(run), signal.SIGCONT)
         assert "NOT DELIVERED: use the emergency stop" in said
         page.with_text("#delivery", "Stop delivered after")
         assert over(run)
@@ -137,8 +129,7 @@ def test_stop_says_that_a_frozen_run_did_not_take_it_and_that_it_did_later(brows
 def test_stop_says_that_a_server_does_not_answer(browser, folder, blow):
     run = live(folder)
     with console(folder) as served:
-        page = browser.open(served.link)
-        page.until("feed?.following && feed.lines.length > 5")
+        page = following(browser, served.link)
         served.process.send_signal(blow)
         said = pressed(page, lambda: page.click("#stop"))
         assert "NOT DELIVERED: use the emergency stop" in said
@@ -152,8 +143,7 @@ def test_stop_is_delivered_where_the_disk_takes_no_order_and_samples_are_lost(br
     resource = pytest.importorskip("resource", reason="the system has no limits of a process")
     run = live(folder)
     with console(folder) as served:
-        page = browser.open(served.link)
-        page.until("feed?.following && feed.lines.length > 5")
+        page = following(browser, served.link)
         page.evaluate(  # as envelopes of a run that lost seven samples are
             "(() => { const show = feed.envelope.bind(feed); feed.envelope = (data, at) => { "
             "new DataView(data).setBigUint64(at + 8, 7n, true); show(data, at); }; })()"
@@ -178,15 +168,14 @@ def test_stop_is_not_taken_for_delivered_by_what_an_old_run_tells_and_its_end_is
     assert over(old)
     run = live(folder)
     with console(folder) as served:
-        page = browser.open(served.link)
-        page.until("feed?.following && feed.lines.length > 5")
-        os.kill(number(run), signal.SIGSTOP)
+        page = following(browser, served.link)
+        os.kill(pid_of(run), signal.SIGSTOP)
         try:
             page.evaluate(f"stopAll(); watch(state.runs.find((r) => r.id === '{old.id}'))")
             page.until("feed.over")
             page.with_text("#delivery", "NOT DELIVERED: use the emergency stop")
         finally:
-            os.kill(number(run), signal.SIGCONT)
+            os.kill(pid_of(run), signal.SIGCONT)
         assert over(run)
         page.evaluate("refresh = async () => { state.runs = [{ alive: true, spec: { job: 'live' } }]; }")  # which hangs
         page.evaluate("stop = { began: performance.now() }; delivered()")
@@ -209,10 +198,9 @@ def test_stop_while_a_run_is_about_to_begin_stops_it(browser, folder):
 def test_old_pages_order_nothing_and_a_run_that_wakes_refuses_what_waited(browser, folder):
     run = live(folder)
     with console(folder) as served:
-        page = browser.open(served.link)
-        page.until("feed?.following && feed.lines.length > 5")
+        page = following(browser, served.link)
         page.click("[data-say=accept]")
-        os.kill(number(run), signal.SIGSTOP)
+        os.kill(pid_of(run), signal.SIGSTOP)
         try:
             beat = page.evaluate("feed.beat")
             run.say("accept", beat=beat, until=time.monotonic() + 0.6)  # as a page that has not noticed yet
@@ -220,7 +208,7 @@ def test_old_pages_order_nothing_and_a_run_that_wakes_refuses_what_waited(browse
             assert page.evaluate("$('yes').disabled")
             assert page.count("[data-say]:disabled") == 4
         finally:
-            os.kill(number(run), signal.SIGCONT)
+            os.kill(pid_of(run), signal.SIGCONT)
         seen = until(run, "order")
         assert [(m["word"], m["done"]) for m in seen if m["kind"] == "order"] == [("accept", False)]
         page.with_text("#events li", "refused: accept")

@@ -151,7 +151,7 @@ class Console:
             {
                 "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
                 "left_out": self.files.left_out, "read_only": self._read_only,
-                "page": _name_of(request), "now": time.time(),
+                "now": time.time(),
             }
         )  # fmt: skip
 
