@@ -33,6 +33,8 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, assemble, stable
 from ambid.physics.linear_model import LinearModel, Parameter
 
+_LOOK = 3  # steps of a search with which another delay is looked at
+
 
 def greybox(
     model: LinearModel,
@@ -261,9 +263,9 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
             promise = max(promise, promise_of(extend(fit, free, before, work)))
         if promise < price:
             return replace(fit, freed=None if rows is None else rows[0])
-        neighbour = _better_neighbour(fit, tick)
-        if neighbour is not None:
-            fit = neighbour
+        other = _better_delay(fit, tick)
+        if other is not None:
+            fit = other
             continue
         freed = search(free, start, tick=tick, work=work)
         total = free.delay_samples(freed.vector)
@@ -287,17 +289,23 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     return fit
 
 
-def _better_neighbour(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
-    """The fit with one sample of delay more or less, if one of them is better: a start may have missed the delay."""
-    best = fit
-    for delay in (fit.problem.delay + 1, fit.problem.delay - 1):
-        if delay >= 0:
-            problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
-            neighbour = search(problem, carry(fit, problem), tick=tick, work=workspace_near(fit, problem))
-            # compared per sample, because a longer delay may leave one sample less
-            if neighbour.criterion / neighbour.problem.n_used < best.criterion / best.problem.n_used:
-                best = neighbour
-    return best if best is not fit else None
+def _better_delay(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
+    """The fit at another whole delay, if one is better: under feedback the likelihood has minima far apart."""
+    others = [d for d in range(max(MAX_DELAY, fit.problem.delay + 1) + 1) if d != fit.problem.delay]
+    trials = [_at_delay(fit, d, tick, steps=_LOOK) for d in others]
+    nearest = min(trials, key=_per_sample)
+    other = search(nearest.problem, nearest.vector, tick=tick, work=nearest.work)
+    return other if _per_sample(other) < _per_sample(fit) else None
+
+
+def _at_delay(fit: Fit, delay: int, tick: Callable[[], None] | None, *, steps: int) -> Fit:
+    problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
+    return search(problem, carry(fit, problem), steps=steps, tick=tick, work=workspace_near(fit, problem))
+
+
+def _per_sample(fit: Fit) -> float:
+    """The criterion per sample, as a longer delay may leave fewer samples."""
+    return fit.criterion / fit.problem.n_used
 
 
 def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit:

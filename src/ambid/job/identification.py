@@ -197,8 +197,9 @@ def identify_axis(
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
     """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if the
-    model fits now and no check fails that did not before. Else the first estimate stays, with its causes; also where a
-    fixed value may be what is wrong, unless the cause changes in time.
+    model fits now, fewer checks fail, and none that did not before, but that a fixed value shows as wrong. Else the
+    first estimate stays, with its causes; also where a fixed value may be what is wrong, unless the cause changes in
+    time.
     """
     from ambid.validation.causes import extended, told
     from ambid.validation.residuals import P_LEAST
@@ -221,7 +222,8 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
             checks["estimates_agree"] = first.checks["estimates_agree"]
         estimate = replace(estimate, checks=checks, extended=tuple(dict.fromkeys(told(c) for c in taken)))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
-    return estimate if after < before and not after & _OF_THE_MODEL else first
+    worse = after & _OF_THE_MODEL or after - before - {"fixed_agree"} or len(after) >= len(before)
+    return first if worse else estimate
 
 
 def _judged(
@@ -310,7 +312,7 @@ def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
 
     check = check_units(fit.problem.parameters(fit.vector), rig.parameters, signals, fit.problem.model)
     constrained = [p for p in rig.parameters if p.role != "free" and p.value]
-    if not constrained or not (doubt or check.values["unusual"]):
+    if not constrained or fit.problem.extra is not None or not (doubt or check.values["unusual"]):
         return check
     free = [replace(p, role="free", value=None, sd=None) if p in constrained else p for p in rig.parameters]
     with contextlib.suppress(EstimationError, np.linalg.LinAlgError):

@@ -136,14 +136,26 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     if delay_given:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
-    if lines:
-        groups.append(("line", tuple(((x.channel, w),) for x in lines for w in waves_at(x.k, course.t.size).T)))
+    groups += [("line", columns) for columns in _waving(lines, course.t.size)]
     found = _tested(look, groups)
     if lines:
-        found[-1] = replace(found[-1], size=lines[0].k * rate_hz / course.t.size, p=min(found[-1].p, lines[0].p))
+        line = min((found.pop(), found.pop()), key=_net)
+        found.append(replace(line, size=lines[0].k * rate_hz / course.t.size, p=min(line.p, lines[0].p)))
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
-    return sorted(found, key=lambda c: _PENALTY * c.sizes.size - c.gain)
+    return sorted(found, key=_net)
+
+
+def _net(cause: Cause) -> float:
+    """What a cause costs, less what it explains."""
+    return _PENALTY * cause.sizes.size - cause.gain
+
+
+def _waving(lines: Sequence[_Line], n: int) -> list[tuple[Column, ...]]:
+    """Return columns of lines, each in its channel, and each as a force and a voltage, as the loop's own source."""
+    waves = [(line.channel, w) for line in lines for w in waves_at(line.k, n).T]
+    both = tuple(((channel, w),) for _, w in waves for channel in ("force", "voltage"))
+    return [tuple(((channel, w),) for channel, w in waves), both] if lines else []
 
 
 def extended(
@@ -155,8 +167,8 @@ def extended(
     *,
     doubtful: bool,
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
-    """Fit again with the strongest cause of those `found`, and those about as strong, their sizes estimated beside the
-    parameters.
+    """Fit again with the strongest cause of those `found`, and those about as strong or else alone, their sizes
+    estimated beside the parameters.
 
     `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new
     ones. None where one of them cannot be taken in, or may stand for a fixed value that is `doubtful`, or the search
@@ -177,8 +189,16 @@ def extended(
     sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
     if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
         return None  # what is of higher degree would move them too
-    parts = [*taken, *(replace(c, sizes=np.zeros(c.sizes.size)) for c in (cause, *alike.values()))]
-    step = [cause.sizes if k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
+    more = _with_causes(fit, means, plain, taken, (cause, *alike.values()))
+    return _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
+
+
+def _with_causes(
+    fit: Fit, means: Mapping[str, float], plain: PredictorProblem, taken: Sequence[Cause], new: Sequence[Cause]
+) -> tuple[Fit, tuple[Cause, ...]] | None:
+    """Fit again with causes beside those `taken`; None where the search does not settle, or a walk goes on."""
+    parts = [*taken, *(replace(c, sizes=np.zeros(c.sizes.size)) for c in new)]
+    step = [new[0].sizes if k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
     for _ in range(_TURNS):
         parts = [replace(c, sizes=c.sizes + more) for c, more in zip(parts, step, strict=True)]
         problem = _corrected(plain, [z for c in parts for z in c.columns], np.concatenate([c.sizes for c in parts]))
