@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ambid
+from ambid.errors import EstimationError
 from ambid.record import Channel, Record
 from ambid.rig import default_rig
 from ambid.validation.facts import agreements, belonging, between_samples, facts, mean_resistance, one_sided
@@ -36,6 +37,31 @@ def test_means_of_a_current_with_one_sign_give_the_resistance():
     value, sd = mean_resistance(carried())
     assert abs(value - 4.0) < 2 * sd < 0.15
     assert mean_resistance(carried(offset=0.4))[0] == pytest.approx(4.4, abs=0.02)
+
+
+def test_means_of_opposite_signs_are_contradicted_before_any_fit():
+    way = carried()
+    back = replace(
+        way, channels=tuple(replace(c, values=c.values * (-1.0) ** (c.name == "current")) for c in way.channels)
+    )
+    check = facts(back)["ohm"]
+    assert facts(way)["ohm"].passed
+    assert not check.passed
+    assert check.cause == "ohm"
+    assert "reversed" in check.detail
+
+
+def test_what_the_means_contradict_is_told_also_where_the_record_is_refused():
+    """A current that is reversed, or reads -8 A at rest beside a voltage in parts of the supply's."""
+    ball = ambid.simulate("levitated-ball", duration=3.0, seed=1)
+    columns = {c.name: c.values.copy() for c in ball.channels}
+    units = {c.name: c.unit for c in ball.channels}
+    with pytest.raises(EstimationError, match=r"^mean voltage over mean current is -4\.\d+ .*'current' is reversed"):
+        ambid.identify(columns | {"current": -columns["current"]}, rate_hz=ball.rate_hz, units=units)
+    shifted = columns | {"current": columns["current"] - 8.0, "voltage": columns["voltage"] / 12.0}
+    estimate = ambid.identify(shifted, rate_hz=ball.rate_hz, units=units)
+    assert not estimate.checks["ohm"].passed
+    assert estimate.verdict.word != "usable"
 
 
 def test_a_current_of_both_signs_gives_none():

@@ -167,7 +167,10 @@ def identify_axis(
     clock.lap("read")
     say("identify")
     delay = rig.channel(plant.inputs[0]).delay
-    fit = greybox(plant, signals_of(bench, plant), rig.parameters, delay=delay, tick=lambda: say("identify"))
+    try:
+        fit = greybox(plant, signals_of(bench, plant), rig.parameters, delay=delay, tick=lambda: say("identify"))
+    except EstimationError as refusal:
+        raise EstimationError(_with_facts(str(refusal), bench, rig)) from None
     if fit.status == "failed":
         raise EstimationError(
             "the search found no stable predictor for this record. Check columns, signs and fixed values"
@@ -193,6 +196,14 @@ def identify_axis(
         estimate = replace(estimate, validation=validation(estimate, other))
         clock.lap("validate")
     return replace(estimate, timing_s=clock.laps, used=bench)
+
+
+def _with_facts(refusal: str, bench: Record, rig: Rig) -> str:
+    """Put what the record says by itself before a refusal, whose guess may be wrong then."""
+    from ambid.validation.facts import facts
+
+    against = [c.detail for c in facts(bench, rig).values() if not c.passed]
+    return f"{'; '.join(against)}. Further: {refusal}" if against else refusal
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:

@@ -26,6 +26,7 @@ from ambid.record import Record
 from ambid.rig import Rig
 
 _FAR = 2.0  # standard deviations between R and the means, whose offsets are allowed for generously
+_FURTHER = 4.0  # and below zero, from which the means alone contradict a coil
 _OFFSET = 0.005  # of a channel's largest value: its offset (sd), where the rig says nothing
 _ONE_SIDED = 0.02  # part of a current's largest value that may lie beyond zero
 _SHARP, _OFFSETS = 0.02, 0.5  # R known so well (sd over R) and so far from the means is not of the same mean current
@@ -80,10 +81,7 @@ def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> d
     roles = set(record.names)
     checks: dict[str, Check] = {}
     if {"voltage", "current"} <= roles:
-        known = mean_resistance(record, rig)
-        text = "voltage and current have no mean that shows R" if known is None else _ohms(*known)
-        level = {} if known is None else {"value": known[0], "sd": known[1]}
-        checks["ohm"] = Check(passed=True, detail=text, values=level)
+        checks["ohm"] = _means(mean_resistance(record, rig))
     if {"position", "current"} <= roles:
         known_pair = Check(passed=True, detail="position and current are of one run: the force shows")
         checks["belonging"] = known_pair if belongs else belonging(record)
@@ -92,6 +90,18 @@ def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> d
         checks["position_size"] = _position_size(record["position"].values)
     checks["log_runs"] = _log_runs(record)
     return checks
+
+
+def _means(known: tuple[float, float] | None) -> Check:
+    if known is None:
+        return Check(passed=True, detail="voltage and current have no mean that shows R")
+    (value, sd), text = known, _ohms(*known)
+    negative = value < -_FURTHER * sd
+    if negative:
+        text += (
+            ", and no coil's is negative: one of the two is reversed, or reads far from zero at rest, or is no voltage"
+        )
+    return Check(passed=not negative, detail=text, values={"value": value, "sd": sd}, cause="ohm" if negative else "")
 
 
 def _ohms(value: float, sd: float) -> str:
@@ -227,7 +237,7 @@ def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of:
     passed = abs(far) <= NormalDist().inv_cdf(0.5 + 0.5 * within ** (1.0 / of))
     i0 = float(record["current"].values.mean())
     detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
-    if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS:
+    if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS and mean > -_FURTHER * mean_sd:
         passed, detail = True, f"{detail}: the means are those of offsets"
     if not passed:
         detail += (
