@@ -72,7 +72,8 @@ class Uncertainty:
     # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
     disagreement: Array
     bias: Array  # (n,), SI, what causes that the tests name have done to the estimate; part of all intervals
-    apart: Array  # (n,), SI, how far facts without a fit are from the numbers that they contradict; part of them too
+    # (n_facts, n), SI, how far the estimate moves to what facts without a fit say that contradict it; part of them too
+    apart: Array
 
     @property
     def widening(self) -> float:
@@ -89,11 +90,11 @@ class Uncertainty:
         only near the truth: correlations from the scores, the larger of both deviations, plus the disagreement.
         """
         if not robust:
-            return np.asarray(self.information + np.outer(self.bias, self.bias) + np.diag(self.apart**2))
+            return np.asarray(self.information + np.outer(self.bias, self.bias) + self.apart.T @ self.apart)
         plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
         larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
-        away = np.column_stack([self.disagreement, self.bias])
-        return np.asarray(self.robust * np.outer(larger, larger) + away @ away.T + np.diag(self.apart**2))
+        away = np.vstack([self.disagreement, self.bias, self.apart])
+        return np.asarray(self.robust * np.outer(larger, larger) + away.T @ away)
 
     def standard_deviations(self, *, robust: bool) -> Array:
         """Return deviations (n,), SI, from the information matrix, or `robust` ones, which are never smaller."""
@@ -112,7 +113,8 @@ class Uncertainty:
         parts = {name: kept @ getattr(self, name) @ kept.T + own for name in ("information", "robust", "fisher")}
         away = {name: kept @ getattr(self, name) for name in ("disagreement", "bias")}
         values, weakest = weakest_direction(self.names, parts["information"], scale)
-        return replace(self, **parts, **away, scale=scale, singular_values=values, weakest=weakest)
+        apart = self.apart @ kept.T
+        return replace(self, **parts, **away, apart=apart, scale=scale, singular_values=values, weakest=weakest)
 
     def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
         """Return which parameters have a relative standard deviation below 25 %."""
@@ -148,7 +150,7 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
         fisher=(whole[:n, :n] + more) * unit,
         disagreement=np.zeros(n),
         bias=np.zeros(n),
-        apart=np.zeros(n),
+        apart=np.zeros((0, n)),
     )
 
 

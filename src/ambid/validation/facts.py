@@ -270,18 +270,22 @@ def sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: float
 def informed(
     fit: Fit, rig: Rig, record: Record, facts: Mapping[str, Check], spread: Uncertainty, *, robust: bool
 ) -> tuple[Fit, Uncertainty, tuple[Array, Array] | None]:
-    """Let facts tell of an estimate: what one contradicts is widened by how far apart they are, and the weight moves it
-    where the rig says that one magnet carries it and both agree; then gain and h are given, (n,) each.
+    """Let facts tell of an estimate: what one contradicts is widened by how far apart they are, beside k_i all that
+    would move with it, cov(θ, k_i)/var(k_i) times that; the weight moves the estimate where the rig says that one
+    magnet carries it and both agree, and then gain and h are given, (n,) each.
 
     The weight says k_i - w m = 0 within a part s of k_i (of the law, the current's zero, as wrong as the means say, and
     what its check counts), h = (1, -w)/(w m) over k_i and m; with covariance P of the estimate, the gain is
     P h / (hᵀ P h + s²). The move has to be one in which the criterion is a parabola.
     """
-    theta, names, apart = fit.problem.parameters(fit.vector), spread.names, {"R": facts["ohm"].size or 0.0}
-    weight, n = facts.get("gravity_balance"), len(spread.names)
-    if weight is not None and not weight.passed:
-        apart["k_i"] = (weight.values["expected"] - weight.values["k_i_over_m"]) * theta["m"]
-    spread = replace(spread, apart=np.array([apart.get(name, 0.0) for name in names]))
+    theta, names, n = fit.problem.parameters(fit.vector), spread.names, len(spread.names)
+    weight, covariance, moves = facts.get("gravity_balance"), spread.covariance(robust=robust), list[Array]()
+    if not facts["ohm"].passed and "R" in names:  # an offset explains it as well, and leaves the others
+        moves.append((facts["ohm"].size or 0.0) * np.eye(n)[names.index("R")])
+    if weight is not None and not weight.passed and "k_i" in names:
+        j, far = names.index("k_i"), weight.values["expected"] - weight.values["k_i_over_m"]
+        moves.append(far * theta["m"] * covariance[j] / covariance[j, j])
+    spread = replace(spread, apart=np.array(moves).reshape(-1, n))
     single = rig.magnet is not None and rig.magnet.kind == "single"
     if weight is None or not (weight.passed and single) or "k_i" not in names:
         return fit, spread, None
