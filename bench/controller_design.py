@@ -169,12 +169,12 @@ def controller_tables(names: Sequence[str] = tuple(CASES)) -> Iterator[Table]:
     for name in names:
         case = CASES[name]()
         before, found = designs(case)
-        rows = [("present loop", "", f"{before.peak_db:.2f} dB ({zone_of(before.peak)})", "", "1", "1", "", "")]
+        rows = [("present loop", "", f"{before.peak_db:.2f} dB ({zone_of(before.peak_db)})", "", "1", "1", "", "")]
         for kind, all_of in found.items():
             made = [d for d in all_of if d.figures]
             peaks = np.array([d.worst.peak_db for d in made] or [math.nan])
             lost = sum(not f.stable for d in made for f in d.figures)
-            zones = sum(zone_of(d.worst.peak) == "A" for d in made if all(f.stable for f in d.figures))
+            zones = sum(zone_of(d.worst.peak_db) == "A" for d in made if all(f.stable for f in d.figures))
             ratios = [[getattr(d.worst, x) / getattr(before, x) for d in made] for x in ("compliance", "settling")]
             rows.append(
                 (

@@ -217,6 +217,23 @@ def test_a_file_that_was_edited_is_refused_on_reading(results, tmp_path, at, val
         ambid.load(tmp_path / "e.json")
 
 
+@pytest.mark.parametrize(
+    ("entry", "why"),
+    [
+        ({}, "'sensitivity.x.peak_db' is missing"),
+        ({"peak_db": None, "frequency_hz": 16.0, "zone": "A", "measured_peak_db": None}, "sensitivity.x.peak_db"),
+        (3.0, "sensitivity.x is 3.0 instead of an object"),
+    ],
+)
+def test_a_sensitivity_that_was_edited_is_refused_in_one_line(results, tmp_path, entry, why):
+    document = json.loads(presentation.document(results["estimate"]))
+    (tmp_path / "e.json").write_text(json.dumps({**document, "sensitivity": {"x": entry}}))
+    with pytest.raises(AmbidError) as refused:
+        ambid.load(tmp_path / "e.json")
+    assert why in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
 @pytest.mark.parametrize("factor", [1e160, 1e-310])
 def test_values_whose_squares_overflow_or_vanish_are_refused_without_a_warning(record, factor):
     table = {f"{c.name} [{c.unit}]": c.values for c in record.channels}

@@ -102,6 +102,32 @@ def test_foreign_and_newer_and_damaged_files_are_refused(tmp_path):
         assert name in str(failure.value)
 
 
+def external_link(channels):
+    channels["0"] = h5py.ExternalLink("secret.h5", "/channels/0")
+
+
+def external_file(channels):
+    channels.create_dataset("0", shape=(500,), dtype="f8", external=[("secret.bin", 0, 4000)])
+
+
+def virtual(channels):
+    layout = h5py.VirtualLayout(shape=(500,), dtype="f8")
+    layout[:] = h5py.VirtualSource("secret.h5", "channels/0", shape=(500,))
+    channels.create_virtual_dataset("0", layout)
+
+
+@pytest.mark.parametrize("borrow", [external_link, external_file, virtual])
+def test_a_record_takes_nothing_from_another_file(tmp_path, borrow):
+    for name in ("secret.h5", "one.h5"):
+        write_record(record(), tmp_path / name)
+    np.zeros(500).tofile(tmp_path / "secret.bin")
+    with h5py.File(tmp_path / "one.h5", "a") as file:
+        del file["channels/0"]
+        borrow(file["channels"])
+    with pytest.raises(RecordError, match="'channels/0' from another file"):
+        read_record(tmp_path / "one.h5")
+
+
 def test_what_cannot_be_stored_is_refused(tmp_path):
     with pytest.raises(RecordError, match="JSON-able"):
         write_hdf5(record().with_step(Step(name="odd", settings={"f": object()})), tmp_path / "r.h5")

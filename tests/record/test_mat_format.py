@@ -30,6 +30,15 @@ def v73(path):
         raw.write(b"MATLAB 7.3 MAT-file, made by a test".ljust(116))
 
 
+def test_a_file_takes_nothing_from_another_one(tmp_path):
+    v73(tmp_path / "secret.mat")
+    v73(tmp_path / "one.mat")
+    with h5py.File(tmp_path / "one.mat", "a") as file:
+        file["more"] = h5py.ExternalLink("secret.mat", "/" + next(iter(file)))
+    with pytest.raises(RecordError, match="'more' from another file"):
+        read_record(tmp_path / "one.mat")
+
+
 @pytest.fixture(params=[v5, v73])
 def path(request, tmp_path):
     request.param(tmp_path / "r.mat")

@@ -512,11 +512,10 @@ def hardest(plants: Sequence[Drawn], examined: Sequence[Examined]) -> dict[str, 
 def worst_plant(plants: Sequence[Drawn], examined: Sequence[Examined]) -> WorstPlant:
     """Return the plant with the highest peak, or the first that is not held."""
     k = int(np.argmax([x.figures.peak for x in examined]))
-    drawn, peak = plants[k], examined[k].figures.peak
+    drawn, peak_db = plants[k], examined[k].figures.peak_db
     return WorstPlant(
-        number=drawn.number, words=drawn.words(), changed=drawn.changed, zone=zone_of(peak),
-        peak_db=float(20.0 * np.log10(peak)),
-    )  # fmt: skip
+        number=drawn.number, words=drawn.words(), changed=drawn.changed, zone=zone_of(peak_db), peak_db=peak_db
+    )
 
 
 def checks_of(goals: Goals, before: Situation, after: Situation, worst: WorstPlant, n: int) -> dict[str, Check]:

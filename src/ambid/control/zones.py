@@ -20,13 +20,9 @@ LONG_TERM = "AB"
 _SURE = 0.99  # probability that is not told more exactly
 
 
-def zone_of(peak: float) -> str:
-    """Return the zone of a peak of the sensitivity that is known exactly, a ratio: ``"A"`` to ``"D"``."""
-    return next((zone for most, zone in ZONES if peak < most), "D")
-
-
-def _zone_of_decibel(peak: float) -> str:
-    return next((zone for most, zone in ZONES if peak < 20.0 * math.log10(most)), "D")
+def zone_of(peak_db: float) -> str:
+    """Return the zone of a peak of the sensitivity that is known exactly, dB: ``"A"`` to ``"D"``."""
+    return next((zone for most, zone in ZONES if peak_db < 20.0 * math.log10(most)), "D")
 
 
 class _Peak(NamedTuple):
@@ -75,12 +71,12 @@ class Zone:
     @property
     def worst(self) -> str:
         """The zone of that upper end, by which a loop is accepted or not."""
-        return _zone_of_decibel(self.upper_db)
+        return zone_of(self.upper_db)
 
     @property
     def letters(self) -> str:
         """``"A"``; where the 95 % interval holds a limit, ``"A or B"``, or ``"A to C"`` with one between."""
-        first = _zone_of_decibel(_Peak(self.peak_db, self.sd_db).ends[0])
+        first = zone_of(_Peak(self.peak_db, self.sd_db).ends[0])
         if first == self.worst:
             return first
         return f"{first} {'or' if ord(self.worst) - ord(first) == 1 else 'to'} {self.worst}"

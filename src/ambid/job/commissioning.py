@@ -408,7 +408,10 @@ class _Guide:
         found = loop_on(self._rig, self._device.info, self.estimate.values, delay=delay)[0]
         loops = {"identified": found} if found is not None else {}
         beside = margins_beside(self.estimate, self.estimate.used)
-        return judge.identification(self.estimate, self.plan, {**loops, **self._loops}, self._experiment, beside)
+        return judge.identification(
+            self.estimate, self.plan, {**loops, **self._loops}, self._experiment, beside,
+            simulated=self._device.info.kind == "simulated",
+        )  # fmt: skip
 
     def _redesign(self) -> Step:
         """Design a better loop on what was identified; where none is found the present one stays."""

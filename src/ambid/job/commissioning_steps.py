@@ -389,11 +389,13 @@ def identification(
     loops: Mapping[str, LoopMargins],
     experiment: Experiment | None = None,
     margins: Margins | None = None,
+    *,
+    simulated: bool = False,
 ) -> Step:
     """Judge an estimate: found at all, parameters identifiable and known as well as `plan` says, nothing implausible;
     and the loop by its zone. `loops`: controller's margins by name, first on the identified plant, then the expected;
-    `experiment`: played, with its promise; `margins`: of the record, drawn. Failed residual tests are cautions, as
-    standard deviations allow for them.
+    `experiment`: played, with its promise; `margins`: of the record, drawn; `simulated`: whether no firmware runs,
+    which alone tries another loop. Failed residual tests are cautions, as standard deviations allow for them.
     """
     findings: list[str] = []
     reasons: list[str] = []
@@ -430,17 +432,24 @@ def identification(
         reasons.append(f"the sensitivity at the position is not known, and the loop cannot be judged: {why}")
     for zone in map(Zone.read, estimate.sensitivity.values()):
         numbers |= {"sensitivity_db": zone.peak_db, "sensitivity_upper_db": zone.upper_db}
-        against, notes = _by_zone(zone, "" if plan.redesign else _offer())
+        against, notes = _by_zone(zone, "" if plan.redesign else _offer(simulated=simulated))
         remedy = "design a better loop, and load that" if against and not reasons else ""
-        reasons, cautions = [*reasons, *against], [*cautions, *notes]
+        reasons, cautions = [*reasons, *against], [*cautions, *notes, *_untested(margins)]
     return Step(
         name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
         pictures=(margins_picture(loops, margins),) if loops else (), remedy=remedy,
     )  # fmt: skip
 
 
-def _offer() -> str:
-    return f". Commission again with {setting('redesign')}, or design a better loop on estimate.json"
+def _offer(*, simulated: bool) -> str:
+    again = "" if simulated else f"Commission again with {setting('redesign')}, or d"
+    return f". {again or 'D'}esign a better loop on estimate.json"
+
+
+def _untested(margins: Margins | None) -> list[str]:
+    """Say where the predicted peak lies at frequencies that the record does not excite."""
+    band = None if margins is None else margins.checks.get("band")
+    return [f"band: {band.detail}"] if band is not None and not band.passed else []
 
 
 def _by_zone(zone: Zone, offer: str) -> tuple[list[str], list[str]]:
@@ -498,7 +507,7 @@ def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]
     against, notes = _by_zone(loops["after"].sensitivity["x"].rating, "")
     return Step(
         name="load", findings=tuple(findings), reasons=(*kept.reasons, *hover.reasons, *against),
-        cautions=(*kept.cautions, *cautions, *notes), numbers=numbers,
+        cautions=(*kept.cautions, *cautions, *notes, *_untested(loops["after"])), numbers=numbers,
         pictures=(measured_picture(loops), *hover.pictures),
     )  # fmt: skip
 

@@ -331,10 +331,11 @@ def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Exam
         )
     both = [new.figures for old, new in zip(before, after, strict=True) if old.figures.stable]
     peak, most = worst_of(both).peak, goals.limits["peak"]
-    if peak > SAME * most or zone_of(peak) > zone_of(most):
+    zone, limit = (zone_of(20.0 * math.log10(x)) for x in (peak, most))
+    if peak > SAME * most or zone > limit:
         raise EstimationError(
-            f"the best loop found has {said('peak', peak)} (zone {zone_of(peak)}) on the plants that judge, above the "
-            f"limit of {said('peak', most)} (zone {zone_of(most)}), by default what the present loop has; none is "
+            f"the best loop found has {said('peak', peak)} (zone {zone}) on the plants that judge, above the "
+            f"limit of {said('peak', most)} (zone {limit}), by default what the present loop has; none is "
             f"offered. Give the goal peak alone, or {raised('peak', peak)}"
         )
 

@@ -198,7 +198,7 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
     measured = measure(loop, clean, spectra)
     found, of = sensitivity_by_axis(loop, measured), loop.controller
     top = int(np.argmax(loop.singular))
-    ratio, hz = float(loop.singular[top]), float(loop.frequency_hz[top])
+    largest, hz = float(20.0 * np.log10(loop.singular[top])), float(loop.frequency_hz[top])
     band = None if spectra is None else (float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1]))
     checks = checks_of(loop, found, measured, band)
     if not estimate.passed:
@@ -212,7 +212,7 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
         speed=speed,
         controller={"source": of.source, "order": list(of.orders), "misfit": of.misfit},
         sensitivity=found,
-        largest_singular={"peak_db": float(20.0 * np.log10(ratio)), "frequency_hz": hz, "zone": zone_of(ratio)},
+        largest_singular={"peak_db": largest, "frequency_hz": hz, "zone": zone_of(largest)},
         margins=margins_by_axis(loop), compliance=compliance_by_axis(loop), checks=checks,
         curves=curves_of(loop, measured), disk=Disk.of(loop.sensitivity, loop.frequency_hz),
         room=room_by_axis(loop, noise, room, machine), noise=whose,

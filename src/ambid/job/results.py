@@ -92,7 +92,12 @@ def _object(text: str, path: Path, what: str, job: str) -> Mapping[str, Any]:
 
 
 def _estimate(document: Mapping[str, Any], path: str) -> Any:
+    from ambid.control.margins import AxisSensitivity
+
     nonlinear, where = "law" in document, f"estimate {path}"
+    if document.get("sensitivity"):  # kept as it stands in the file, and judged only where it is shown
+        kind = Mapping[str, AxisSensitivity]
+        read_whole(lambda: read_as(kind, document["sensitivity"], "sensitivity"), where, "estimate", "identify")  # type: ignore[type-abstract]
     if "modes" in document:
         from ambid.rotor.estimate import rotor_estimate_from_json
 

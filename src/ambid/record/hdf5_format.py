@@ -179,6 +179,24 @@ def _history_text(record: Record) -> str:
         ) from None
 
 
+@contextmanager
+def hdf5_of(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file for reading (h5py), and refuse one that takes something from another file, wherever that is."""
+    import h5py
+
+    def linked(name: str | bytes, link: Any) -> str | bytes | None:
+        return name if link.type == h5py.h5l.TYPE_EXTERNAL else None
+
+    def stored(name: str, node: Any) -> str | None:
+        return name if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual) else None
+
+    with h5py.File(path, "r") as file:
+        if name := file.id.links.visit(linked, info=True) or file.visititems(stored):
+            shown = name if isinstance(name, str) else name.decode("utf-8", "replace")
+            raise RecordError(f"record {path} takes {shown!r} from another file. Copy all of it into one file")
+        yield file
+
+
 def read_hdf5(path: str | Path) -> Record:
     """Read a record of layout ``ambid.record/1``, bit for bit as written; ``file`` and ``sha256`` in the provenance are
     of this file where the record had none.
@@ -190,7 +208,7 @@ def read_hdf5(path: str | Path) -> Record:
     if not h5py.is_hdf5(path):
         raise RecordError(f"record {path} is not an HDF5 file, or is damaged. Copy it again, or name its real format")
     try:
-        with h5py.File(path, "r") as file:
+        with hdf5_of(path) as file:
             schema = file.attrs.get("schema")
             if schema is None:
                 inside = ", ".join(sorted(file)[:5]) or "nothing"

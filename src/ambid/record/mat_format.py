@@ -16,6 +16,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
+from ambid.record.hdf5_format import hdf5_of
 from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, structures
 from ambid.record.record import Record, file_bytes, sha256_of
 from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, check_gap_policy, refuse_gaps, seconds, uniform_record
@@ -231,7 +232,7 @@ def _content_v73(path: Path) -> dict[str, Any]:
         return values.T if values.ndim >= 2 else values
 
     try:
-        with h5py.File(path, "r") as file:
+        with hdf5_of(path) as file:
             content: dict[str, Any] = taken(file)
             return content
     except (

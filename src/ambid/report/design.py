@@ -74,7 +74,8 @@ def figure_text(name: str, x: float) -> str:
     if not np.isfinite(x):
         return _NONE
     if name == "peak":
-        return f"{20.0 * np.log10(x):.2f} dB ({zone_of(x)})"
+        decibel = 20.0 * np.log10(x)
+        return f"{decibel:.2f} dB ({zone_of(decibel)})"
     return sized(x, {**FIGURES, "pole": "1/s"}[name])
 
 
