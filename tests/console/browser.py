@@ -45,6 +45,8 @@ class Page:
         return self._browser.send(method, self._session, **words)
 
     def evaluate(self, script):
+        """The value of a script that names what the page lends (`window.ambidConsole`)."""
+        script = f"with (window.ambidConsole ?? {{}}) {{ {script} }}"
         answer = self.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]["exception"]["description"]
         return answer["result"].get("value")

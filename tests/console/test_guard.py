@@ -62,7 +62,7 @@ def test_the_link_opens_the_page_once(folder):
             assert started.ask("GET", f"/?token={again}", cookie="").status in (400, 403, 414, 431)
 
 
-GETS = ["/", "/api/state", "/api/rigs/1", "/reports/1", "/static/console.js"]
+GETS = ["/", "/api/state", "/api/rigs/1", "/reports/1", "/static/main.js"]
 
 
 @pytest.mark.parametrize("path", GETS)

@@ -1,5 +1,6 @@
 """Stop in a browser: whatever is open, frozen, dead or full, it is clicked, and says whether the run took it."""
 
+import json
 import os
 import shutil
 import signal
@@ -177,8 +178,8 @@ def test_stop_is_not_taken_for_delivered_by_what_an_old_run_tells_and_its_end_is
         finally:
             os.kill(pid_of(run), signal.SIGCONT)
         assert over(run)
-        page.evaluate("refresh = async () => { state.runs = [{ alive: true, spec: { job: 'live' } }]; }")  # which hangs
-        page.evaluate("stop = { began: performance.now() }; delivered()")
+        hangs = {"runs": [{"alive": True, "spec": {"job": "live"}}], "delivered": True}
+        page.evaluate(f"window.fetch = async () => Response.json({json.dumps(hangs)}); stopAll()")
         page.with_text("#delivery", "has not ended yet. If the rotor still moves, use the emergency stop")
         browser.close(page)
 

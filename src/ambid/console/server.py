@@ -56,10 +56,10 @@ _CONNECTIONS = 48  # before those that ask nothing give way
 _HEAD_S = 15.0  # in which a connection has to say what it asks
 _REPORT_BYTES = 1 << 26
 _SERIAL = re.compile(r"(/dev/(tty|cu|serial/by-(id|path)/)[\w.:+-]+|COM[0-9]{1,3})", re.ASCII)
-_STATIC = {
-    "console.js": ("console/static", "text/javascript"), "console.css": ("console/static", "text/css"),
-    "uPlot.iife.min.js": ("data", "text/javascript"), "uPlot.min.css": ("data", "text/css"),
-}  # fmt: skip
+_STATIC = {"uPlot.iife.min.js": "data", "uPlot.min.css": "data"} | {
+    f.name: "console/static" for f in files("ambid").joinpath("console/static").iterdir() if not f.name.endswith("html")
+}
+_TYPES = {"js": "text/javascript", "css": "text/css"}
 _WORDS = {"live": ("track", "hold", "accept", "revert"), "commission": ("go", "no")}  # beside "stop", of any
 # of each job: files that it reads, by their kinds; other fields with their types; the ending of what it makes
 _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
@@ -125,10 +125,10 @@ class Console:
         return Response(_resource("console/static", "console.html"), media_type="text/html")
 
     async def _static(self, request: Request) -> Response:
-        place = _STATIC.get(request.path_params["name"])
-        if place is None:
+        name = request.path_params["name"]
+        if name not in _STATIC:
             return Response(status_code=404)
-        return Response(_resource(place[0], request.path_params["name"]), media_type=place[1])
+        return Response(_resource(_STATIC[name], name), media_type=_TYPES[name.rpartition(".")[2]])
 
     async def _login(self, request: Request) -> Response:
         assert self.guard is not None
