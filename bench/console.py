@@ -2,7 +2,8 @@
 
 ``PYTHONPATH=. python bench/console.py [SECONDS]``: a record of an unstable bearing at 20 kHz is replayed, recorded and
 tracked with its three signals, then eight signals are shown without tracking; where Chromium is installed, a page
-watches. Figures are printed; none is asserted.
+watches. Before that, one axis of 20,000 samples is identified in turn by the command and by a click on the page: the
+time until the verdict stands. Figures are printed; none is asserted.
 """
 
 from __future__ import annotations
@@ -33,11 +34,25 @@ from tests.console.pages import Started, console, pid_of, prototype_rig
 from tracking_benches import RATE, preset_bench, record_of
 
 SIGNALS = 8
+# a click on Identify, and the time until the frame that shows the verdict and the table, ms
+_CLICK = """(() => {
+  const old = document.querySelector("#detail h2.result"), began = performance.now();
+  window.shownAfter = null;
+  new MutationObserver((_, own) => {
+    const head = document.querySelector("#detail h2.result");
+    if (!head || head === old || !document.querySelector("#detail td.good")) return;
+    own.disconnect();
+    requestAnimationFrame(() => { window.shownAfter = performance.now() - began; });
+  }).observe(document.body, { childList: true, subtree: true });
+  [...document.querySelectorAll("#detail button")].find((b) => b.textContent === "Identify").click();
+})()"""
 BLOCK = 100
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def main(seconds: float) -> None:
+    with tempfile.TemporaryDirectory() as made:
+        verdicts(Path(made), 7)
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         write_record(record_of(preset_bench().samples("change", 1, seconds, 0.6 * seconds)), folder / "played.h5")
@@ -62,6 +77,45 @@ def main(seconds: float) -> None:
             writer.wait()
     with tempfile.TemporaryDirectory() as made:
         killed(Path(made), 20)
+
+
+def verdicts(folder: Path, times: int) -> None:
+    """Identify by the command and from a page in turn: from the click, or the start, until the verdict is shown."""
+    record, rig = folder / "axis.csv", folder / "axis.toml"
+    for words in (
+        ["simulate", "unstable-bearing", "--duration", "1", "--seed", "1", "-o", str(record)],
+        ["init", str(record), "-o", str(rig)],
+    ):
+        subprocess.run([sys.executable, "-m", "ambid", *words], check=True, capture_output=True)
+    if CHROMIUM is None:
+        print("from click to verdict: not measured, Chromium is not installed")
+        return
+    took: dict[str, list[float]] = {"command": [], "page": []}
+    with console(folder) as served, chromium() as browser:
+        page = browser.open(served.link)
+        page.click(page.with_text("#list tr", "axis.csv"))
+        page.with_text("#detail button", "Identify")
+        page.put("#detail [name=rig]", "axis.toml")
+        for _ in range(times):
+            before = time.perf_counter()
+            subprocess.run(
+                [sys.executable, "-m", "ambid", "identify", str(record), "--rig", str(rig)],
+                check=True,
+                capture_output=True,
+            )
+            took["command"].append(time.perf_counter() - before)
+            page.evaluate(_CLICK)
+            took["page"].append(page.until("window.shownAfter", 60.0) / 1e3)
+            page.until("!document.querySelector('#work').children.length && document.querySelector('.report a')", 120.0)
+    command, clicked = (np.array(x) for x in took.values())
+    ratio = clicked / command
+    print(
+        f"from click to verdict, {times} in turn: page {np.median(clicked):.2f} s, command {np.median(command):.2f} s,"
+    )
+    print(
+        f"  ratio median {np.median(ratio):.2f}, most {ratio.max():.2f}; load average {os.getloadavg()[0]:.1f}",
+        flush=True,
+    )
 
 
 def killed(folder: Path, times: int) -> None:

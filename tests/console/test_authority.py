@@ -222,7 +222,7 @@ def test_half_a_slot_is_not_read_and_one_that_others_hold_is_refused(tmp_path):
     path = tmp_path / "slot"
     path.write_bytes(path.read_bytes().replace(b'"a"', b'"b"'))
     assert slot.read() == {}
-    with slot.alone(), pytest.raises(AmbidError, match="another console"), Slot(path).alone():
+    with slot.transaction(), pytest.raises(AmbidError, match="another console"), Slot(path).transaction():
         pass
     with pytest.raises(ValueError, match="do not fit"):
         slot.write({"a": "x" * 10_000})

@@ -161,7 +161,7 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
         assert told(until(Runs(tmp_path).one(page.json("POST", "/api/runs", wish)["id"])), "end")[0]["how"] == "done"
         wish = {"job": "identify", "record": page.number("rec.csv"), "rig": page.number("drafted.toml"), "out": "found"}
         seen = until(Runs(tmp_path).one(page.json("POST", "/api/runs", wish)["id"]))
-        assert told(seen, "result")[0]["verdict"] == load(tmp_path / "found.json").verdict.word
+        assert told(seen, "result")[0]["content"]["verdict"] == load(tmp_path / "found.json").verdict.word
         assert {"found.json", "found.html"} <= {f["name"] for f in page.state()["files"]}
         assert page.json("POST", "/api/runs", wish)["error"].startswith("found.json already exists")
         for text, why in (('modle = "x"', "modle"), (ELSEWHERE.format("/etc/passwd"), "is outside of")):

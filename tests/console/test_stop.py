@@ -178,9 +178,16 @@ def test_stop_is_not_taken_for_delivered_by_what_an_old_run_tells_and_its_end_is
         finally:
             os.kill(pid_of(run), signal.SIGCONT)
         assert over(run)
-        hangs = {"runs": [{"alive": True, "spec": {"job": "live"}}], "delivered": True}
-        page.evaluate(f"window.fetch = async () => Response.json({json.dumps(hangs)}); stopAll()")
-        page.with_text("#delivery", "has not ended yet. If the rotor still moves, use the emergency stop")
+        for off, alive, words in ((False, True, "took Stop"), (False, False, "is over"), (True, True, None)):
+            run = {"id": "1", "alive": alive, "off": off, "spec": {"job": "live"}}
+            page.evaluate(
+                "window.fetch = async (path) => Response.json(path === '/api/stop' ? { runs: ['1'], delivered: true } "
+                f": {{ runs: [{json.dumps(run)}] }}); stopAll()"
+            )
+            lacks = (
+                f"The run {words}, and its device has not confirmed that its output is off. If the rotor still moves"
+            )
+            page.with_text("#delivery", "output off after" if off else lacks)
         browser.close(page)
 
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ambid.console.slot import Slot, locked, opened
+from ambid.console.slot import Slot, descriptor, lock
 from ambid.errors import AmbidError
 
 LEASE_S = 3.0
@@ -36,7 +36,7 @@ class Lease:
 
     def take(self, page: str, name: str, *, over: bool = False) -> None:
         """Give a page the right, `over`: also where another has it; a refusal names that one."""
-        with self.slot.alone() as content:
+        with self.slot.transaction() as content:
             other = _fresh(content)
             if other and other.get("page") != page and not over:
                 raise AmbidError(f"{other.get('name')} has the right to order this run. Take over first, or stop only")
@@ -44,13 +44,13 @@ class Lease:
 
     def beat(self, page: str) -> None:
         """Take a sign of life of a page; it matters where that page holds the right."""
-        with suppress(AmbidError, OSError), self.slot.alone() as content:
+        with suppress(AmbidError, OSError), self.slot.transaction() as content:
             if _fresh(content).get("page") == page:
                 content["at"] = time.monotonic()
 
     def drop(self, page: str) -> None:
         """Take the right back from a page that is gone."""
-        with suppress(AmbidError, OSError), self.slot.alone() as content:
+        with suppress(AmbidError, OSError), self.slot.transaction() as content:
             if content.get("page") == page:
                 content.clear()
 
@@ -63,11 +63,11 @@ def _fresh(content: Mapping[str, Any]) -> Mapping[str, Any]:
 def busy(folder: Path) -> bool:
     """Whether a run has the bench of a folder, also one that only begins, or whose files another user keeps."""
     try:
-        fd = opened(folder / ".ambid" / "bench.lock", os.O_RDWR)
+        fd = descriptor(folder / ".ambid" / "bench.lock", os.O_RDWR)
     except OSError as failure:
         return not isinstance(failure, (FileNotFoundError, NotADirectoryError))
     try:
-        return not locked(fd)
+        return not lock(fd)
     finally:
         os.close(fd)
 
@@ -95,8 +95,8 @@ class Machine:
             path.parent.mkdir(parents=True, exist_ok=True)
             slot = Slot(path)
             slot.make()
-            fd = opened(path, os.O_RDWR)
-            if not locked(fd):
+            fd = descriptor(path, os.O_RDWR)
+            if not lock(fd):
                 os.close(fd)
                 self.release()
                 time.sleep(_NAME_S)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from io import FileIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-from ambid.console.slot import opened
+from ambid.console.slot import descriptor
 from ambid.errors import AmbidError
 from ambid.record import ENDINGS
 
@@ -34,6 +36,7 @@ class Entry:
     schema: str = ""
     verdict: str = ""
     why: str = ""  # the first reason of the verdict
+    loop: bool = False  # of a rig: whether it has a [loop]
 
 
 class Folder:
@@ -43,7 +46,7 @@ class Folder:
         self.path = folder
         self.left_out = 0
         self._numbers: dict[str, int] = {}
-        self._seen: dict[str, tuple[float, int, tuple[str, str, str]]] = {}
+        self._seen: dict[str, tuple[float, int, dict[str, Any]]] = {}
 
     def entries(self) -> list[Entry]:
         """Return records, rigs, results and reports, the newest first; `left_out` tells how many are not listed."""
@@ -73,8 +76,8 @@ class Folder:
             raise AmbidError(f"the {kind} is longer than {most >> 20} MiB. Open it without the console")
         return data
 
-    def new(self, name: object, ending: str) -> Path:
-        """Return the place of a file that is to be made; its name is that of a plain new file."""
+    def new(self, name: object, ending: str, *, once: bool = True) -> Path:
+        """Return the place of a file that is to be made; its name is a plain one, `once`: that no file has yet."""
         text = str(name).strip()
         base = text.removesuffix(ending)
         if not base or len(base) > 80 or not all(c.isalnum() or c in "-_. " for c in base) or base.startswith("."):
@@ -82,9 +85,22 @@ class Folder:
                 f"the name {text[:80]!r} is none for a file: letters, digits, - and _ make one. Correct it"
             )
         path = self.path / (base + ending)
-        if path.exists() or path.is_symlink():
+        if once and (path.exists() or path.is_symlink()):
             raise AmbidError(f"{path.name} already exists. Choose another name")
         return path
+
+    def free(self, name: str) -> str:
+        """Take a name that no result has yet, nor its report or rig: the name itself, or the next with a number; its
+        result is made, empty.
+        """
+        for k in count(1):
+            own = name if k == 1 else f"{name}-{k}"
+            paths = [self.path / f"{own}{ending}" for ending in (".json", ".html", ".toml")]
+            if not any(p.exists() or p.is_symlink() for p in paths):
+                with suppress(FileExistsError):  # another run was faster
+                    paths[0].open("x").close()
+                    return own
+        raise AssertionError
 
     def _files(self) -> Iterator[tuple[Path, os.stat_result]]:
         """Yield plain files with an ending that is known; links are not followed."""
@@ -109,13 +125,11 @@ class Folder:
         known = self._seen.get(name)
         if known is None or known[:2] != (about.st_mtime, about.st_size):
             self._seen[name] = known = (about.st_mtime, about.st_size, _said(path, kind))
-        schema, verdict, why = known[2]
-        if not kind or (kind in _KNOWN and not schema):
+        if not kind or (kind in _KNOWN and not known[2]):
             return None
         number = self._numbers.setdefault(name, len(self._numbers) + 1)
         return Entry(
-            number=number, name=name, kind=kind, bytes=about.st_size, changed=about.st_mtime, schema=schema,
-            verdict=verdict, why=why,
+            number=number, name=name, kind=kind, bytes=about.st_size, changed=about.st_mtime, **known[2]
         )  # fmt: skip
 
 
@@ -144,27 +158,28 @@ def plain(path: Path, folder: Path) -> os.stat_result | None:
 
 def open_plain(path: Path) -> FileIO:
     """Open a plain file for reading."""
-    return FileIO(opened(path, os.O_RDONLY))
+    return FileIO(descriptor(path, os.O_RDONLY))
 
 
-def _said(path: Path, kind: str) -> tuple[str, str, str]:
-    """Return what a rig, a result or a ledger says of itself: schema, verdict and its first reason."""
+def _said(path: Path, kind: str) -> dict[str, Any]:
+    """Return what a rig, a result or a ledger says of itself, as fields of its `Entry`; nothing of what is none."""
     if kind not in _KNOWN:
-        return "", "", ""
+        return {}
     try:
         with open_plain(path) as file:
-            data = file.read(_LONGEST + 1 if kind == "result" else 4000)
+            data = file.read(1 << 20 if kind == "rig" else _LONGEST + 1 if kind == "result" else 4000)
         if kind != "result":
             schema, mark = {"rig": ("ambid.rig/1", b'"ambid.rig/1"'), "ledger": ("ambid.ledger", _SQLITE)}[kind]
-            return (schema if mark in data else ""), "", ""
+            loop = kind == "rig" and re.search(rb"^\s*\[loop\]", data, re.MULTILINE) is not None
+            return {"schema": schema, "loop": loop} if mark in data[:4000] else {}
         document: Any = json.loads(data) if len(data) <= _LONGEST else None
     except (OSError, ValueError, RecursionError):
-        return "", "", ""
+        return {}
     if not isinstance(document, dict) or not str(document.get("schema", "")).startswith("ambid."):
-        return "", "", ""
+        return {}
     verdict = document.get("verdict")
     said = verdict if isinstance(verdict, dict) else {}
     reasons = said.get("reasons")
     first = reasons[0] if isinstance(reasons, list) and reasons else None
     why = first.get("text", "") if isinstance(first, dict) else first or ""
-    return str(document["schema"])[:40], str(said.get("word", ""))[:40], str(why)[:400]
+    return {"schema": str(document["schema"])[:40], "verdict": str(said.get("word", ""))[:40], "why": str(why)[:400]}

@@ -208,6 +208,30 @@ class Runs:
         return not self._place.is_symlink() and not self._place.parent.is_symlink()
 
 
+def size_of(spec: Mapping[str, Any]) -> float:
+    """Return how much a run has to do: bytes of the record, estimate or ledger that its spec names, else its length."""
+    names = [spec[k] for k in ("record", "estimate", "ledger") if k in spec]
+    with suppress(OSError):
+        return float(sum((Path(spec["folder"]) / str(n)).stat().st_size for n in names)) or float(
+            spec.get("seconds", 0.0)
+        )
+    return 0.0
+
+
+def usual_times(run: Run) -> tuple[float, float] | None:
+    """Return after which times a run may have its verdict, and be over, s: as the latest of its job in the same place,
+    by how much they had to do; None where none is known.
+    """
+    job, size = run.spec.get("job"), size_of(run.spec)
+    for other in Runs(run.place, run.place.parent).all():
+        taken = other.status.get("taken")
+        if isinstance(taken, dict) and other.id != run.id and other.spec.get("job") == job:
+            verdict, whole, before = (float(taken[k]) for k in ("verdict", "whole", "size"))
+            scale = size / before if size and before else 1.0
+            return scale * verdict, scale * whole
+    return None
+
+
 _CHILDREN: list[subprocess.Popen[bytes]] = []  # of this process: asked for their end, so that none stays a zombie
 
 

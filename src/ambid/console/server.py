@@ -39,7 +39,7 @@ from ambid.console.runs import MOVING, Run, Runs
 from ambid.errors import AmbidError
 from ambid.settings.caller import setting
 
-_LOOKS = ("preview", "history")  # jobs that change nothing
+_LOOKS = ("preview", "history", "result")  # jobs that change nothing
 
 _POLL_S = 0.02  # between two looks at a feed
 _ANSWER_POLL_S = 0.005  # between two looks for an answer
@@ -63,8 +63,9 @@ _TYPES = {"js": "text/javascript", "css": "text/css"}
 _WORDS = {"live": ("track", "hold", "accept", "revert"), "commission": ("go", "no")}  # beside "stop", of any
 # of each job: files that it reads, by their kinds; other fields with their types; the ending of what it makes
 _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
-    "preview": ({"record": "record"}, {"rate_hz": float}, ""),
+    "preview": ({"record": "record"}, {"rate_hz": float, "gaps": str}, ""),
     "history": ({"ledger": "ledger"}, {"bearing": str}, ""),
+    "result": ({"estimate": "result"}, {}, ""),
     "rig": ({}, {"text": str}, ".toml"),
     "identify": ({"record": "record", "rig": "rig"}, {}, ".json"),
     "margins": ({"record": "record", "rig": "rig", "estimate": "result"}, {}, ".json"),
@@ -83,9 +84,10 @@ _CHOICES = {
     "pace": ("real-time", "fastest"),
     "excitation": ("multisine", "schroeder", "prbs", "steps"),
     "method": ("pid", "lqg"),
+    "gaps": ("error", "interpolate", "cut"),
 }
-_NEEDED = {"preview": ("record",), "history": ("ledger",), "identify": ("record", "rig"), "margins": ("rig",),
-           "design": ("rig", "estimate"), "live": ("rig", "port"),
+_NEEDED = {"preview": ("record",), "history": ("ledger",), "result": ("estimate",), "identify": ("record", "rig"),
+           "margins": ("rig",), "design": ("rig", "estimate"), "live": ("rig", "port"),
            "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip
 
 
@@ -296,7 +298,8 @@ class Console:
         if missing:
             raise AmbidError(f"{job} needs {missing[0]}. Choose one")
         if ending:
-            name = self.files.new(asked.get("out", ""), "" if ending == "/" else ending).name
+            once = ending != ".json"  # a result takes the next name that is free
+            name = self.files.new(asked.get("out", ""), "" if ending == "/" else ending, once=once).name
             spec["out"] = name.removesuffix(".json")
         return spec
 
@@ -418,8 +421,9 @@ def _end(run: Run) -> Mapping[str, Any]:
 
 def _about(run: Run) -> dict[str, Any]:
     said = {k: run.spec.get(k) for k in ("job", "out", "seconds", "port", *_FILES)}
+    off = run.status.get("off") is True  # whether its device has confirmed that its output is off
     shown = {k: v[:200] if isinstance(v, str) else v for k, v in said.items() if isinstance(v, str) or _finite(v)}
-    return {"id": run.id, "spec": {"job": "", **shown}, "began": int(run.id.partition("-")[0])}
+    return {"id": run.id, "spec": {"job": "", **shown}, "began": int(run.id.partition("-")[0]), "off": off}
 
 
 def _finite(value: object) -> bool:

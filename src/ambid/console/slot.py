@@ -43,7 +43,7 @@ class Slot:
     def read(self) -> dict[str, Any]:
         """Return what is in it; nothing where it was never written, or is no file of this kind."""
         with suppress(OSError, ValueError, RecursionError):
-            fd = opened(self._path, os.O_RDONLY)
+            fd = descriptor(self._path, os.O_RDONLY)
             try:
                 return _content(fd)
             finally:
@@ -52,19 +52,19 @@ class Slot:
 
     def write(self, content: Mapping[str, Any]) -> None:
         """Replace what is in it; one process at a time."""
-        fd = opened(self._path, os.O_RDWR)
+        fd = descriptor(self._path, os.O_RDWR)
         try:
             _put(fd, content)
         finally:
             os.close(fd)
 
     @contextmanager
-    def alone(self) -> Iterator[dict[str, Any]]:
+    def transaction(self) -> Iterator[dict[str, Any]]:
         """Yield what is in it, to be changed, while no other process changes it, and write what has become of it."""
-        fd = opened(self._path, os.O_RDWR)
+        fd = descriptor(self._path, os.O_RDWR)
         try:
             end = time.monotonic() + _PATIENCE_S
-            while not locked(fd):
+            while not lock(fd):
                 if time.monotonic() > end:
                     raise AmbidError("another console, which does not answer, holds this run. End it, or try again")
                 time.sleep(0.005)
@@ -76,7 +76,7 @@ class Slot:
             os.close(fd)
 
 
-def locked(fd: int) -> bool:
+def lock(fd: int) -> bool:
     """Lock a file for this process and those that inherit it, until the last of them closes it or dies; whether it is.
 
     Where the system has no locks, that is not looked at.
@@ -94,7 +94,7 @@ def locked(fd: int) -> bool:
     return True
 
 
-def opened(path: Path, how: int) -> int:
+def descriptor(path: Path, how: int) -> int:
     """Open a plain file that exists: what is a link, a pipe or a device raises `OSError` and is not waited for."""
     fd = os.open(path, how | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY")))
     if not S_ISREG(os.fstat(fd).st_mode):

@@ -24,12 +24,14 @@ import numpy as np
 
 from ambid.console.envelope import EnvelopeTap, rounded, throttled
 from ambid.console.feed import FeedWriter
-from ambid.console.folder import plain
+from ambid.console.folder import Folder, plain
 from ambid.console.orders import LATE, Desk, Order
-from ambid.console.runs import MOVING, Heard, Run
+from ambid.console.runs import MOVING, Heard, Run, size_of, usual_times
+from ambid.console.words import PAGE_WORDS, RIG_WORDS
 from ambid.errors import AmbidError
 from ambid.estimation.result import NORMAL_95
 from ambid.record.record import INSIDE
+from ambid.settings.caller import speaking
 
 if TYPE_CHECKING:
     from ambid.acquisition.session import Recording
@@ -58,9 +60,15 @@ class Worker:
         self.wished = threading.Event()  # the operator wants the end
         self.flags: deque[Order] = deque()
         self.cancelled = "cancelled before a result was there"
-        self._asked, self._asks, self._follows = 0, False, False
+        self._question, self._asks, self._follows = 0, False, False
+        self._powered, self._off = (
+            False,
+            False,
+        )  # whether a device may have its output on; whether it was told to be off
         self._answers: deque[Order] = deque()
         self._began = time.perf_counter()
+        self._verdict_s: float | None = None  # when the result was told
+        self._usual = usual_times(run)
         self._progress = throttled(_LINE_S, self._tell_progress)
 
     def work(self) -> int:
@@ -72,7 +80,8 @@ class Worker:
         self.feed.tell("begin", {"job": self.spec["job"], "wall": time.time()}, sticky="begin")
         threading.Thread(target=self._listen, name="operator", daemon=True).start()
         try:
-            JOBS[self.spec["job"]](self)
+            with speaking("console", PAGE_WORDS if self.spec["job"] == "preview" else RIG_WORDS):
+                JOBS[self.spec["job"]](self)
             self.end("done", "")
         except AmbidError as refusal:
             self.end("refused", str(refusal))
@@ -95,8 +104,12 @@ class Worker:
 
     def end(self, how: str, why: str) -> None:
         """Tell the end, also on a full disk."""
+        if self.spec["job"] in MOVING and not self._powered:
+            self.output_off()
         said = {"how": how, "why": why, "wall": time.time()}
-        self.desk.note(end={**said, "why": why[:400]})
+        whole = time.perf_counter() - self._began
+        taken = {"verdict": self._verdict_s or whole, "whole": whole, "size": size_of(self.spec)}
+        self.desk.note(end={**said, "why": why[:400]}, **({"taken": taken} if how == "done" else {}))
         self.feed.tell("end", said, sticky="end", last=True)
 
     def tick(self, stage: str, done: float | None = None, /) -> None:
@@ -127,15 +140,15 @@ class Worker:
 
     def agreed(self, what: str) -> bool:
         """Ask the operator, and wait for the answer."""
-        self._asked += 1  # an answer to the question before is none
+        self._question += 1  # an answer to the question before is none
         self._asks = True
-        self.feed.tell("ask", {"what": what, "number": self._asked}, sticky="ask")
+        self.feed.tell("ask", {"what": what, "number": self._question}, sticky="ask")
         word = ""
         while not word and not self.wished.is_set():
             time.sleep(_LISTEN_S)
             while self._answers and not word:
                 order = self._answers.popleft()
-                old = "" if order.number == self._asked else "this question is no longer asked"
+                old = "" if order.number == self._question else "this question is no longer asked"
                 word = order.word if self._obeys(order, old) else ""
         self._asks = False
         self.feed.tell("ask", {"what": "", "answer": word or "no"}, sticky="ask")
@@ -165,32 +178,61 @@ class Worker:
             raise AmbidError(f"{name} is no plain file of the folder any more. Choose another one")
         return found
 
-    def give(self, result: Any, name: str, record: object = None, *, drawn: str = "") -> None:
-        """Write a result and its report beside each other, and tell them; `drawn`: what its figure shows."""
-        from ambid.job.presentation import drawing, text
+    def give(self, result: Any) -> str:
+        """Write a result under its name, or the next that is free, and tell it; the name."""
+        from ambid.job.presentation import content
+
+        name = Folder(self.folder).free(str(self.spec["out"]))
+        result.save(self.folder / f"{name}.json")
+        self.feed.tell("result", {"name": name, "content": content(result)}, sticky="result")
+        self._verdict_s = time.perf_counter() - self._began
+        return name
+
+    def draw(self, result: Any, name: str, *, caption: str = "") -> None:
+        """Write the report of a result that was told, and tell it, with the figure where it has a `caption`; what fails
+        is told too, and changes nothing of the result.
+        """
+        from ambid.job.presentation import drawing
+        from ambid.report.picture import image
 
         self._tell_progress("report", None)
         report = self.folder / f"{name}.html"
-        for path in (self.folder / f"{name}.json", report):
-            if path.exists() or path.is_symlink():
-                raise AmbidError(f"{path.name} already exists. Choose another name")
-        result.save(self.folder / f"{name}.json")
-        result.report(report, record)
-        verdict, pictures = result.verdict, list[Mapping[str, str]]()
-        if drawn:
-            from ambid.report.picture import image
+        try:
+            result.report(report)
+            figures = [{"title": name, "caption": caption, "image": image(drawing(result), name)}] if caption else []
+            told = {"name": report.name, "pictures": figures, "why": ""}
+        except Exception as failure:
+            with suppress(OSError):
+                traceback.print_exc()
+            told = {"name": "", "pictures": [], "why": f"the report could not be drawn: {failure}"}
+        self.feed.tell("report", told, sticky="report")
 
-            pictures = [{"title": name, "caption": drawn, "image": image(drawing(result), name)}]
-        self.feed.tell(
-            "result",
-            {"name": name, "verdict": verdict.word, "reasons": [r.text for r in verdict.reasons],
-             "text": text(result, width=110), "report": report.name, "pictures": pictures},
-            sticky="result",
-        )  # fmt: skip
+    @contextmanager
+    def minded(self, device: Any) -> Iterator[Any]:
+        """Yield a device of which is told that its output is off: once it has confirmed that after a stop, and at the
+        end.
+        """
+        self._powered = True
+        try:
+            yield _Minded(device, self)
+        finally:
+            with suppress(AmbidError):  # the line is lost: nobody knows whether it is off
+                device.stop()
+                self._powered = False
+                self.output_off()
+
+    def output_off(self) -> None:
+        """Tell that the device has confirmed that its output is off."""
+        if not self._off:
+            self._off = True
+            self.desk.note(off=True)
+            self.feed.tell("off", {}, sticky="off")
 
     def _tell_progress(self, stage: str, done: float | None) -> None:
         taken = time.perf_counter() - self._began
-        self.feed.tell("progress", {"stage": stage, "done": done, "seconds": round(taken, 2)}, sticky="progress")
+        usual = self._usual and self._usual[self._verdict_s is not None]
+        told = {"stage": stage, "done": done, "seconds": round(taken, 2), "left": usual and round(usual - taken, 2)}
+        self.feed.tell("progress", told, sticky="progress")
 
     def _listen(self) -> None:
         if self.spec["job"] in MOVING:
@@ -226,7 +268,7 @@ class Worker:
             self._obeys(order)
         elif order.word in _FLAGS and self._follows:
             self.flags.append(order)
-        elif order.word in ("go", "no") and self._asks and order.number == self._asked:
+        elif order.word in ("go", "no") and self._asks and order.number == self._question:
             self._answers.append(order)
         elif order.word in (*_FLAGS, "go", "no"):
             asks = order.word in _FLAGS
@@ -235,14 +277,15 @@ class Worker:
 
 def _preview(worker: Worker) -> None:
     """Tell what a record holds, and draft its rig."""
-    from ambid.job.presentation import text
+    from ambid.job.presentation import content
     from ambid.record import read_record
     from ambid.rig import draft_rig
     from ambid.validation.inspection import inspect
 
     path = worker.path("record")
     assert path is not None
-    record = read_record(path, rate_hz=worker.spec.get("rate_hz"))
+    how: dict[str, Any] = {k: worker.spec[k] for k in ("rate_hz", "gaps") if k in worker.spec}
+    record = read_record(path, **how)
     worker.tick("channels")
     step = max(1, -(-record.n_samples // _PREVIEW))
     starts = np.arange(0, record.n_samples, step)
@@ -253,16 +296,26 @@ def _preview(worker: Worker) -> None:
     ]  # fmt: skip
     worker.tick("diagnostics")
     try:
-        draft = draft_rig(record)
+        draft = draft_rig(record, reading=how)
     except AmbidError as refusal:
         draft = ""
         worker.note(str(refusal))
     worker.feed.tell(
         "preview",
         {"channels": channels, "t": rounded(record.start_s + starts / record.rate_hz), "rate_hz": record.rate_hz,
-         "samples": record.n_samples, "draft": draft, "text": text(inspect(record), width=110)},
+         "samples": record.n_samples, "draft": draft, "content": content(inspect(record))},
         sticky="preview",
     )  # fmt: skip
+
+
+def _result(worker: Worker) -> None:
+    """Tell what a result says."""
+    from ambid.job.presentation import content
+    from ambid.job.results import load
+
+    path = worker.path("estimate")
+    assert path is not None
+    worker.feed.tell("result", {"name": path.stem, "content": content(load(path))}, sticky="result")
 
 
 def _rig(worker: Worker) -> None:
@@ -279,16 +332,15 @@ def _rig(worker: Worker) -> None:
 def _identify(worker: Worker) -> None:
     from ambid.job import identify
 
-    record = worker.path("record")
-    found = identify(record, worker.path("rig"), tick=worker.tick)  # type: ignore[arg-type]
-    worker.give(found, str(worker.spec["out"]), record)
+    found = identify(worker.path("record"), worker.path("rig"), tick=worker.tick)  # type: ignore[arg-type]
+    worker.draw(found, worker.give(found))
 
 
 def _margins(worker: Worker) -> None:
     from ambid.job import margins
 
     found = margins(worker.path("record") or worker.path("estimate"), worker.path("rig"))  # type: ignore[arg-type]
-    worker.give(found, str(worker.spec["out"]), drawn="The loop as it is, with the zones of ISO 14839-3.")
+    worker.draw(found, worker.give(found), caption="The loop as it is, with the zones of ISO 14839-3.")
 
 
 def _design(worker: Worker) -> None:
@@ -296,12 +348,13 @@ def _design(worker: Worker) -> None:
     from ambid.job import design_controller
     from ambid.rig import rig_text
 
-    name, estimate = str(worker.spec["out"]), worker.path("estimate")
+    estimate = worker.path("estimate")
     assert estimate is not None
     found = design_controller(estimate, worker.path("rig"), method=worker.spec.get("method", "pid"), tick=worker.tick)
-    worker.give(found, name, drawn="The loop before and after, with the zones of ISO 14839-3.")
+    name = worker.give(found)
     with (worker.folder / f"{name}.toml").open("x", encoding="utf-8") as file:
         file.write(rig_text(found.new_rig, worker.folder))
+    worker.draw(found, name, caption="The loop before and after, with the zones of ISO 14839-3.")
 
 
 def _export(worker: Worker) -> None:
@@ -343,7 +396,7 @@ def _live(worker: Worker) -> None:
         str(spec["port"]), rig, wanted, bench=None, pace=spec.get("pace", "real-time"), force=False, note=worker.note,
         tick=worker.tick,
     )  # fmt: skip
-    with opening as (device, course):
+    with opening as (bare, course), worker.minded(bare) as device:
         view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
         told = _Lines(worker)
         opening_record = recording(device, rig, out, course, on_trouble=lambda e: worker.note(str(e)))
@@ -405,6 +458,21 @@ def _before_others() -> None:
         return
     with suppress(AttributeError, OSError):
         os.nice(-10)
+
+
+class _Minded:
+    """A device that tells its run when it has been stopped because the operator wanted that."""
+
+    def __init__(self, device: Any, worker: Worker) -> None:
+        self._device, self._worker = device, worker
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
+
+    def stop(self) -> None:
+        self._device.stop()
+        if self._worker.wished.is_set():
+            self._worker.output_off()
 
 
 class _Lines:
@@ -469,13 +537,10 @@ def _number(x: float) -> float | None:
 
 def _summary(made: Any) -> Mapping[str, Any]:
     from ambid.estimation.estimate import fields_json
-    from ambid.job.presentation import text
+    from ambid.job.presentation import content
 
     latency = made.track.totals.latency
-    return {
-        "verdict": made.track.verdict.word, "text": text(made.track, width=110), "overruns": made.overruns,
-        "latency": latency and fields_json(latency),
-    }  # fmt: skip
+    return {"content": content(made.track), "overruns": made.overruns, "latency": latency and fields_json(latency)}
 
 
 def _commission(worker: Worker) -> None:
@@ -484,6 +549,7 @@ def _commission(worker: Worker) -> None:
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning_steps import Plan
+    from ambid.report.document import plain_parts
     from ambid.report.drawing import single
     from ambid.report.picture import image
     from ambid.rig import load_rig
@@ -503,7 +569,7 @@ def _commission(worker: Worker) -> None:
         good.extend([found.name] if found.passed else [])
         content = {
             "name": found.name, "passed": found.passed, "findings": list(found.findings),
-            "reasons": list(found.reasons), "cautions": list(found.cautions), "text": found.text,
+            "reasons": list(found.reasons), "cautions": list(found.cautions), "parts": plain_parts(found.parts),
             "pictures": [
                 {"title": p.title, "caption": p.caption, "image": image(single(p.block), p.title)}
                 for p in found.pictures
@@ -517,7 +583,7 @@ def _commission(worker: Worker) -> None:
     opening = opened(
         str(spec["port"]), rig, bench=None, pace=spec.get("pace", "fastest"), seed=0, closes=True, note=worker.note
     )
-    with opening as device:
+    with opening as bare, worker.minded(bare) as device:
         folder.mkdir()
         told: Mapping[str, Any] = {"passed": False, "verdict": "unusable", "reasons": []}
         try:
@@ -557,14 +623,12 @@ def _history(worker: Worker) -> None:
 
 def drawn(found: History) -> Mapping[str, Any]:
     """Return verdict, series, estimates and events of a history; of a long one the latest."""
-    from ambid.job.presentation import text
+    from ambid.job.presentation import content
 
     first = max(0, len(found.estimates) - _MOST_ESTIMATES)
     asked = ("taken_at", "record", "job", "status", "verdict", "failed", "version")
-    verdict = found.verdict
     return {
-        "bearing": found.bearing, "plant": found.plant, "verdict": verdict.word,
-        "reasons": [r.text for r in verdict.reasons], "text": text(found, width=110), "left_out": first,
+        "bearing": found.bearing, "plant": found.plant, "content": content(found), "left_out": first,
         "estimates": [{k: getattr(e, k) for k in asked} for e in found.estimates[first:]],
         "series": {name: _series(found, s, first) for name, s in found.measured.items()},
         "events": [{k: getattr(e, k) for k in ("at", "kind", "text", "parameter")} for e in found.events],
@@ -584,7 +648,7 @@ def _series(found: History, s: Series, first: int) -> Mapping[str, Any]:
 
 
 JOBS: Mapping[str, Callable[[Worker], None]] = {
-    "preview": _preview, "rig": _rig, "identify": _identify, "margins": _margins, "design": _design,
+    "preview": _preview, "result": _result, "rig": _rig, "identify": _identify, "margins": _margins, "design": _design,
     "export": _export, "history": _history, "live": _live, "commission": _commission,
 }  # fmt: skip
 

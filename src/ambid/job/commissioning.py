@@ -367,7 +367,7 @@ class _Guide:
             second,
             findings=(*first.findings, *second.findings),
             cautions=(*first.cautions, *second.cautions),
-            text=f"{first.text}\n\n{second.text}",
+            parts=(*first.parts, *second.parts),
             pictures=(*first.pictures, *second.pictures),
         )
 

@@ -48,7 +48,6 @@ from ambid.report.commission import (
 )
 from ambid.report.design import NAMES, figure_text
 from ambid.report.device import acquired_sections
-from ambid.report.document import sections_text
 from ambid.report.estimate import sensitivity_lines
 from ambid.report.numbers import quantity, sized
 from ambid.report.text import pure
@@ -376,9 +375,9 @@ def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Ste
         if column.role in ("position", "current") and column.sd == 0.0
     ]
     cautions = [str(t) for t in done.troubles if not done.not_stored] + [f"{name}: {v}" for v in done.quality.verdict]
-    text = sections_text(acquired_sections(done))
+    parts = tuple(part for section in acquired_sections(done) for part in section.parts)
     return Step(
-        name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), text=text,
+        name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), parts=parts,
         pictures=pictures,
     )  # fmt: skip
 

@@ -18,7 +18,16 @@ from ambid.estimation.estimate import fields_json, json_text, plain_json
 from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
 from ambid.record import Record, read_record
-from ambid.report.document import Document, Lines, Section, page_sections, terminal
+from ambid.report.document import (
+    Document,
+    Lines,
+    Section,
+    page_sections,
+    plain_parts,
+    terminal,
+    told_sections,
+    warnings_of,
+)
 from ambid.report.text import SPREAD, WIDTH, WORDS, Paint, joined, plain, verdict_lines
 
 if TYPE_CHECKING:
@@ -47,6 +56,20 @@ def text(result: Result, *, width: int = WIDTH, paint: Paint = plain) -> str:
     lines = verdict_lines(result.verdict, width=width, paint=paint)
     body = terminal(document_of(result), width=width, paint=paint)
     return joined([lines, [body], [paint(SPREAD, "dim")] if "±" in body else []])
+
+
+def content(result: Result) -> dict[str, Any]:
+    """Return a result, the verdict first, without figures, in the types of JSON, for whoever shows it otherwise."""
+    about = document_of(result)
+    return {
+        "verdict": result.verdict.word, "reasons": [f"{r.check}: {r.text}" for r in result.verdict.reasons],
+        "title": about.headline or about.title, "subtitle": about.subtitle, "warnings": warnings_of(about),
+        "sections": [
+            {"title": s.title, "folded": s.folded, "note": s.note, "parts": plain_parts(s.parts)}
+            for s in told_sections(about)
+        ],
+        "spread": SPREAD,
+    }  # fmt: skip
 
 
 def figure(result: Result, record: Any = None) -> Figure:

@@ -18,7 +18,7 @@ from ambid.control.design import Design
 from ambid.control.margins import Margins
 from ambid.estimation.estimate import fields_json
 from ambid.report.design import loops_block
-from ambid.report.document import Document, Lines, Preformatted, Section, Table, grid
+from ambid.report.document import Document, Lines, Part, Preformatted, Section, Table, grid
 from ambid.report.drawing import (
     BAND,
     BOUND,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
 
-_SEEN = frozenset({"pictures", "text"})  # of the page, not of the file
+_SEEN = frozenset({"pictures", "parts"})  # of the page, not of the file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +60,7 @@ class Step:
     cautions: tuple[str, ...] = ()  # what a reader should know although the step is good enough
     numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)  # the same as numbers, SI
     pictures: tuple[Picture, ...] = ()  # what it saw
-    text: str = ""  # more of it, as on a terminal
+    parts: tuple[Part, ...] = ()  # tables and lines that a page shows beside
     remedy: str = ""  # what to do after it where it is not what its kind of step asks for
 
     @property
@@ -141,7 +141,7 @@ def _section(step: Step, title: str) -> Section:
         parts=[
             Lines(lines=[text for text in step.findings if text]),
             *([grid(rows)] if len(rows) > 1 else []),
-            *([Preformatted(text=step.text)] if step.text else []),
+            *step.parts,
         ],
         figure=None if picture is None else partial(single, picture.block),
         note="" if picture is None else picture.caption,

@@ -6,7 +6,7 @@ forms render the same `Document`. A column that is added to a table appears in a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from types import MappingProxyType
@@ -46,10 +46,12 @@ class Column:
 
     label: Cell = ""
     cell: Callable[[Any], Cell] | None = None  # of a row; None: the column is in frames alone
+    wide: Callable[[Any], Cell] | None = None  # the same on pages, where that is another text
     frame: Mapping[str, Callable[[Any], object]] = field(default_factory=lambda: MappingProxyType({}))
     right: bool = False  # whether a terminal aligns it right
     spare: bool = False  # whether a terminal that is too narrow leaves it out
     page: bool = False  # whether it is on pages alone
+    about: bool = False  # whether it says more of the first column, as a page may where a pointer rests
     sparse: bool = False  # whether it is left out where no row has a text in it
 
 
@@ -67,7 +69,8 @@ class Table:
         for column in self.columns:
             if column.cell is None or (column.page and not page) or (column.spare and not spare):
                 continue
-            cells = [column.cell(row) for row in self.rows]
+            write = (column.wide if page else None) or column.cell
+            cells = [write(row) for row in self.rows]
             if column.sparse and not any(text_of([cell]) for cell in cells):
                 continue
             if column.right:
@@ -228,8 +231,8 @@ def part_lines(part: Part, width: int, paint: Paint = plain) -> list[str]:
     return [line for x in parts for line in part_lines(x, width, paint)]
 
 
-def page_sections(document: Document) -> list[Section]:
-    """Return the sections of a page: those of the document, its figures, and what follows them."""
+def told_sections(document: Document) -> list[Section]:
+    """Return the sections of a page that need no figures, each with a title."""
     sections = list[Section]()
     for section in (s for s in document.sections if s.page and (s.parts or s.figure)):
         title = section.title or text_of(parts_of(section.heading))
@@ -237,8 +240,54 @@ def page_sections(document: Document) -> list[Section]:
             sections.append(replace(section, title=title or "Result"))
         else:
             sections[-1] = replace(sections[-1], parts=(*sections[-1].parts, *section.parts))
+    return sections
+
+
+def page_sections(document: Document) -> list[Section]:
+    """Return the sections of a page: those of the document, its figures, and what follows them."""
     drawn = [Section(title="Figures", figure=document.figure)] if document.drawings is None else document.drawings()
-    return [*sections, *drawn, *document.appendix()]
+    return [*told_sections(document), *drawn, *document.appendix()]
+
+
+def pieces(parts: Sequence[Part]) -> Iterator[tuple[str, Any]]:
+    """Yield what a page shows of parts: paragraphs, tables (rows of cells), and lines as they are."""
+    for part in parts:
+        if isinstance(part, Table) and part.rows:
+            yield "table", part.cells(page=True)[0]
+        elif isinstance(part, Lines):
+            yield from (("paragraph", text) for line in part.lines if (text := text_of(parts_of(line)).strip()))
+        elif isinstance(part, Checks) and part.checks:
+            rows = [
+                (("✓ " if c.passed else "✗ ") + name, (c.detail, "" if c.passed else "bad"))
+                for name, c in part.checks.items()
+            ]
+            yield "table", [("", "finding"), *rows]
+        elif isinstance(part, Fitting):
+            yield from pieces(part.wide)
+        elif isinstance(part, Preformatted):
+            yield "lines", part.text
+
+
+def warnings_of(document: Document) -> list[str]:
+    """Return what a page warns of below its verdict."""
+    return [x for s in document.sections for part in s.parts if isinstance(part, Warnings) for x in part.warnings]
+
+
+def plain_parts(parts: Sequence[Part]) -> list[dict[str, Any]]:
+    """Return what a page shows of parts in the types of JSON; of a table its rows, the labels first, which columns are
+    aligned right, and which one explains the first (None: there is none).
+    """
+    plain = list[dict[str, Any]]()
+    for part in parts:
+        if isinstance(part, Fitting):
+            plain += plain_parts(part.wide)
+        elif isinstance(part, Table) and part.rows:
+            rows, right = part.cells(page=True)
+            about = [k for c in part.columns if c.about for k, label in enumerate(rows[0]) if label == c.label]
+            plain.append({"kind": "table", "content": rows, "right": right, "about": next(iter(about), None)})
+        else:
+            plain += [{"kind": kind, "content": content} for kind, content in pieces([part])]
+    return plain
 
 
 def ending(result: Any, *, checks: bool = True, warnings: bool = True) -> list[Section]:

@@ -14,21 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 from ambid.estimation.result import Verdict
 from ambid.report.document import (
-    Checks,
     Document,
-    Fitting,
-    Lines,
     Part,
     Preformatted,
     Section,
-    Table,
-    Warnings,
     grid,
     page_sections,
+    pieces,
+    warnings_of,
 )
 from ambid.report.drawing import STYLES, WIDE
 from ambid.report.picture import picture
-from ambid.report.text import SPREAD, WORDS, Cell, columns, parts_of, text_of
+from ambid.report.text import SPREAD, WORDS, Cell, columns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,30 +35,6 @@ if TYPE_CHECKING:
 
 
 _LIBRARIES = ("ambid", "numpy", "scipy", "numba")
-
-
-def pieces(parts: Sequence[Part]) -> Iterator[tuple[str, Any]]:
-    """Yield what a page shows of parts: paragraphs, tables (rows of cells), and lines as they are."""
-    for part in parts:
-        if isinstance(part, Table) and part.rows:
-            yield "table", part.cells(page=True)[0]
-        elif isinstance(part, Lines):
-            yield from (("paragraph", text) for line in part.lines if (text := text_of(parts_of(line)).strip()))
-        elif isinstance(part, Checks) and part.checks:
-            rows = [
-                (("✓ " if c.passed else "✗ ") + name, (c.detail, "" if c.passed else "bad"))
-                for name, c in part.checks.items()
-            ]
-            yield "table", [("", "finding"), *rows]
-        elif isinstance(part, Fitting):
-            yield from pieces(part.wide)
-        elif isinstance(part, Preformatted):
-            yield "lines", part.text
-
-
-def warnings_of(document: Document) -> list[str]:
-    """Return what a page warns of below its verdict."""
-    return [x for s in document.sections for part in s.parts if isinstance(part, Warnings) for x in part.warnings]
 
 
 def drawn_picture(section: Section, k: int) -> tuple[str, str]:

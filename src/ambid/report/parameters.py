@@ -47,6 +47,10 @@ class ParameterRow:
         q = self.quantity
         return f"{q.low} … {q.high}" if q.low else ""
 
+    def in_unit(self, interval: str) -> str:
+        """Return an interval with its unit."""
+        return f"{interval} {self.quantity.unit}" if interval and self.quantity.unit not in ("", "1") else interval
+
     @property
     def calibrated(self) -> str:
         """The 95 % interval with calibration; empty where the rig says nothing of it."""
@@ -99,7 +103,8 @@ def word_for_all(verdict: Verdict) -> str:
 
 PARAMETERS: Sequence[Column] = (
     Column(cell=lambda row: row.parameter.name, frame={"name": lambda row: row.parameter.name}),
-    Column(label="meaning", cell=lambda row: (row.meaning, ""), page=True, sparse=True),
+    Column(label="meaning", cell=lambda row: (row.meaning, ""), page=True, sparse=True, about=True),
+    Column(label="role", cell=lambda row: (row.parameter.role, ""), page=True),
     Column(
         label="value ± sd",
         cell=lambda row: row.text,
@@ -114,6 +119,7 @@ PARAMETERS: Sequence[Column] = (
     Column(
         label="95 % interval",
         cell=lambda row: row.interval,
+        wide=lambda row: row.in_unit(row.interval),
         right=True,
         frame={
             "ci95_low": lambda row: row.parameter.ci95[0],
@@ -123,6 +129,7 @@ PARAMETERS: Sequence[Column] = (
     Column(
         label="with calibration",
         cell=lambda row: row.calibrated,
+        wide=lambda row: row.in_unit(row.calibrated),
         right=True,
         sparse=True,
         frame={

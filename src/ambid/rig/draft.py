@@ -37,7 +37,12 @@ WIRED = ("prototype",)
 """Presets with a controller of their own, whose rig, in which columns are its counts, is among the package's data."""
 
 
-def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None = None) -> str:
+def draft_rig(
+    record: Record,
+    ranked: Mapping[str, Sequence[Candidate]] | None = None,
+    *,
+    reading: Mapping[str, object] | None = None,
+) -> str:
     """Guess a rig file.
 
     Parameters
@@ -46,6 +51,8 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
         As read from its file, columns under their own names.
     ranked : Mapping of str to sequence of Candidate, optional
         Columns for each role, the chosen one first; default: as `ambid.rig.roles.rank_roles` ranks them.
+    reading : Mapping of str to object, optional
+        What the record was read with, ``rate_hz`` or ``gaps``: others of its bench are read alike.
 
     Returns
     -------
@@ -55,7 +62,7 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
     """
     axes = axes_of(record)
     if len(axes) > 1:
-        return _draft_rotor(record, axes)
+        return _draft_rotor(record, axes, reading or {})
     ranked = rank_roles(record) if ranked is None else ranked
     coil, resting = bool(ranked["voltage"] and ranked["current"]), at_rest(ranked)
     plant = model("coil" if coil and (resting or not ranked["position"]) else "one-axis")
@@ -85,7 +92,7 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
         "# [operating_point]   # default: the means of the record",
         '# position = { value = 10.0, unit = "mm" }',
         "",
-        *_record_lines(record),
+        *_record_lines(record, reading or {}),
         "# from = 2.0          # s: leave out what comes before, such as the pick-up from rest",
         '# gaps = "error"      # or "interpolate", "cut"',
         _RATE_SD,
@@ -93,10 +100,11 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
     return "\n".join(lines) + "\n"
 
 
-def _record_lines(record: Record) -> list[str]:
-    """Begin the section of records with the layout that the file was read in."""
+def _record_lines(record: Record, reading: Mapping[str, object]) -> list[str]:
+    """Begin the section of records with the layout that the file was read in, and what it was read with."""
     layout = record.history[0].settings.get("layout") if record.history else None
-    return ["[record]", *toml_lines({"layout": layout})] if isinstance(layout, Mapping) else ["# [record]"]
+    known = {**reading, **({"layout": layout} if isinstance(layout, Mapping) else {})}
+    return ["[record]", *toml_lines(known)] if known else ["# [record]"]
 
 
 def axes_of(record: Record) -> list[str]:
@@ -106,7 +114,7 @@ def axes_of(record: Record) -> list[str]:
     return [axis for axis in axes if axis and names & {f"{axis}_voltage", f"{axis}_current"}]
 
 
-def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
+def _draft_rotor(record: Record, axes: Sequence[str], reading: Mapping[str, object]) -> str:
     """Guess the rig of a rotor on many axes: two axes a bearing; without its planes, to be measured, it is refused."""
     name = record.provenance.get("file", "a record")
     lines = [
@@ -133,7 +141,7 @@ def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
     for role, column in _turning(record).items():
         lines += [f"[channels.{role}]", f"column = {toml_text(column.name)}   # CHECK", ""]
     return "\n".join(
-        [*lines, *_record_lines(record), _RATE_SD, "", "# What is not named here is free. A weighed rotor:",
+        [*lines, *_record_lines(record, reading), _RATE_SD, "", "# What is not named here is free. A weighed rotor:",
          "# [parameters]", '# m = { value = 6.2, unit = "kg", role = "fixed" }', "# [modes]", '# count = "auto"', ""]
     )  # fmt: skip
 

@@ -78,8 +78,8 @@ def setting(name: str, value: object = None) -> str:
             value = "closed" if value else "open"
         return flag(name) if value in (None, True) else f"{flag(name)} {value}"
     if _language == "console":
-        label = _words.get(name, name.replace("_", " "))
-        return label if value in (None, True) else f"{label} {value}"
+        label = _words.get(name) or f"{flag(name)} of the command"
+        return label if value in (None, True) else f"{label} = {value}"
     name = _PYTHON.get(name, name)
     if value is None or not name.isidentifier():
         return name
@@ -96,7 +96,11 @@ def _entry(word: str) -> str:
 
 
 def command(job: str, *arguments: object, **settings: object) -> str:
-    """Return the call of a job in the caller's language; what has no function in Python is always a command."""
+    """Return the call of a job in the caller's language, in the console its button; what has no function in Python, or
+    no button, is always a command.
+    """
+    if _language == "console" and job in _words:
+        return _words[job]
     function = _CALLS.get(job, f"ambid.{job}")
     if _language == "python" and function:
         methods = [(_PYTHON[name], settings.pop(name)) for name in ("json", "plot", "report") if name in settings]

@@ -4,6 +4,7 @@ import { drawn, link } from "./files.js";
 import { refresh } from "./lists.js";
 import { orderWords, Watched } from "./run.js";
 import { again, confirmed, question } from "./stop.js";
+import { parts } from "./tables.js";
 
 export class Steps extends Watched {
   constructor(run) {
@@ -32,7 +33,7 @@ export class Steps extends Watched {
     const pictures = el("div", { className: "pictures" }, ...m.pictures.map(drawn));
     put(this.item(m.name), el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
       ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
-      m.text ? el("details", {}, el("summary", {}, "table"), el("pre", {}, m.text)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
+      m.parts.length ? el("details", {}, el("summary", {}, "table"), ...parts(m.parts)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
   }
   question(m) {  // for who may answer; what was answered elsewhere meanwhile is not answered again
     this.asked = m.what && !this.over ? m : null;

@@ -1,116 +1,126 @@
 // A file that is chosen: preview, rig, result, the loop of an estimate; and jobs that compute.
-import { $, ask, el, proven, put, seconds, show, stamp, state, stem, WORDS } from "./core.js";
+import { $, ask, el, proven, put, seconds, show, state, stem, WORDS } from "./core.js";
 import { histories } from "./history.js";
 import { refresh } from "./lists.js";
 import { strip } from "./plot.js";
-import { rigForm } from "./rigform.js";
+import { rigForm, rigView } from "./rigform.js";
 import { listen } from "./run.js";
 import { trouble } from "./stop.js";
+import { sections, verdict } from "./tables.js";
 
 export function choose(file) {
   const detail = $("detail");
-  if (file.kind === "report") { proven(`/reports/${file.number}`).then((address) => window.open(address, "_blank", "noopener")); return; }
   detail.replaceChildren(el("h2", {}, file.name));
   detail.scrollIntoView();
-  if (file.kind === "result") {
-    const report = state.files.find((f) => f.kind === "report" && stem(f.name) === stem(file.name));
-    detail.append(el("p", { className: file.verdict }, WORDS[file.verdict] ?? "no verdict", file.why ? `: ${file.why}` : ""), report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."));
+  if (file.kind === "report") { detail.append(el("p", { className: "hint" }, "The report opens in a tab of its own."), link(file)); proven(`/reports/${file.number}`).then((address) => window.open(address, "_blank", "noopener")); }
+  else if (file.kind === "result") {
+    const beside = [file.name.replace(/\.json$/, ".html"), file.name.replace(/[^/]*$/, "report.html")], report = state.files.find((f) => beside.includes(f.name)), host = el("div");
+    detail.append(el("p", { className: file.verdict }, WORDS[file.verdict] ?? "no verdict", file.why ? `: ${file.why}` : ""), report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."), host);
     if (file.schema.startsWith("ambid.estimate")) loopForm(file, detail);
+    if (!file.schema.startsWith("ambid.commission")) job({ job: "result", estimate: file.number }, (m) => m.kind === "result" && put(host, ...verdict(m.content, { head: "What it says" }), ...sections(m.content))).catch(wrong(host));
   } else if (file.kind === "ledger") {
     detail.append(el("p", { className: "hint" }, "A ledger: what became of bearings is shown under History."));
     $("history-form").elements.ledger.value = file.number;
     put($("history-form").elements.bearing); show("history"); histories();
-  } else if (file.kind === "rig") {
-    ask(`/api/rigs/${file.number}`).then((r) => detail.append(el("pre", {}, r.text))).catch(trouble);
-  } else preview(file, detail);
+  } else if (file.kind === "rig") ask(`/api/rigs/${file.number}`).then((r) => detail.append(...rigView(r.text))).catch(trouble);
+  else preview(file, detail);
 }
 // The loop of an estimate: margins as it is, and a better one.
 function loopForm(file, detail) {
-  const rigs = state.files.filter((f) => f.kind === "rig"), host = el("div");
+  const rigs = state.files.filter((f) => f.kind === "rig" && f.loop), host = el("div");
   const rig = el("select", {}, ...rigs.map((f) => el("option", { value: f.number }, f.name)));
   const method = el("select", {}, el("option", { value: "pid" }, "PID, tuned"), el("option", { value: "lqg" }, "LQG"));
-  let under = false;
-  const run = (name) => async () => {
-    if (under) return;
-    under = true;
-    const spec = { job: name, estimate: file.number, rig: Number(rig.value), out: `${stem(file.name)}-${name}-${stamp()}` };
-    host.replaceChildren();
-    await job(name === "design" ? { ...spec, method: method.value } : spec, host, (m) => m.kind === "result" && results(m, host)).catch(wrong(host));
-    under = false;
-  };
-  detail.append(el("h2", {}, "Its loop"), el("div", { className: "bar" }, el("label", {}, "Rig with [loop] ", rig),
-    el("button", { className: "go", disabled: state.read_only || !rigs.length, onclick: run("margins") }, "Margins"),
-    el("label", {}, "Method ", method), el("button", { className: "go", disabled: state.read_only || !rigs.length, onclick: run("design") }, "Design a better loop")),
-    el("p", { className: "hint" }, "A design writes a rig with the new loop. The controller tries it where Live is started with it as 'Loop to try'."), host);
+  const buttons = [["margins", "Margins"], ["design", "Design a better loop"]].map(([name, label]) => el("button", { className: "go", onclick: async () => {
+    const free = (on) => { for (const b of buttons) b.disabled = !on || state.read_only || !rigs.length; };
+    free(false); put(host);
+    const spec = { job: name, estimate: file.number, rig: Number(rig.value), out: `${stem(file.name)}-${name}` };
+    await job(name === "design" ? { ...spec, method: method.value } : spec, (m) => { results(m, host); if (m.kind === "result") free(true); }).catch(wrong(host));
+    free(true);
+  }, disabled: state.read_only || !rigs.length }, label));
+  detail.append(el("h2", {}, "Its loop"), el("div", { className: "bar" }, el("label", {}, "Rig with [loop] ", rig), buttons[0], el("label", {}, "Method ", method), buttons[1]),
+    el("p", { className: "hint" }, rigs.length ? "A design writes a rig with the new loop. The controller tries it where Live is started with it as 'Loop to try'." : "No rig of this folder has a [loop]: margins and design need one. Write it into the rig of this bench."), host);
 }
 export const drawn = (p) => el("figure", {}, el("img", { src: p.image, className: "drawn", alt: p.title }), el("figcaption", { className: "caption" }, p.caption));
 export function link(report) {
   const anchor = el("a", { href: `/reports/${report.number}`, target: "_blank", rel: "noopener" }, `Open ${report.name}`);
   proven(`/reports/${report.number}`).then((address) => { anchor.href = address; });
-  return el("p", {}, anchor);
+  return el("span", {}, anchor);
 }
 
-// A job that computes: progress, cancel, and what it found.
-export async function job(spec, host, told) {
-  const bar = el("progress", { max: 1 }), words = el("span", {}, "starting");
-  const cancel = el("button", {}, "Cancel");
-  const line = el("p", { className: "bar", role: "status" }, bar, words, cancel);
-  host.append(line);
-  bar.removeAttribute("value");
+// A job that computes: progress in the head of the page, in view wherever the page is scrolled to, cancel, and what it found.
+export async function job(spec, told) {
+  const of = state.files.find((f) => f.number === (spec.record ?? spec.estimate ?? spec.ledger))?.name ?? spec.out ?? "";
+  const bar = el("progress", { max: 1 }), words = el("span", { role: "status" }), cancel = el("button", {}, "Cancel"), line = el("div", { className: "bar" }, bar, words, cancel);
+  let now = { stage: "starting", seconds: 0, left: null }, at = performance.now();
+  const draw = () => {
+    const beyond = (performance.now() - at) / 1000, past = now.seconds + beyond, left = now.left === null ? null : now.left - beyond;
+    if (left > 0) bar.value = past / (past + left); else bar.removeAttribute("value");
+    words.textContent = `${spec.job} ${of}: ${now.stage}, ${seconds(past)}${left === null ? "" : left > 0 ? `, about ${seconds(left)} left` : ", longer than the last time"}`;
+  };
+  $("work").append(line); draw();
+  const beat = setInterval(draw, 250);
   try {
-    const place = ["preview", "history"].includes(spec.job) ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
+    const place = ["preview", "history", "result"].includes(spec.job) ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
     cancel.onclick = () => ask(`${place}/${id}/say`, { word: "stop" }).catch(trouble);
     return await new Promise((done, fail) => listen(id, (m) => {
-      if (m.kind === "progress") {
-        if (m.done === null) bar.removeAttribute("value"); else bar.value = m.done;
-        const left = m.done > 0.05 ? `, about ${seconds(m.seconds * (1 / m.done - 1))} left` : "";
-        words.textContent = `${m.stage}: ${seconds(m.seconds)}${m.done === null ? ", of a length that is not known" : `, ${Math.round(100 * m.done)} %${left}`}`;
-      } else if (m.kind === "end") m.how === "done" ? done() : fail(new Error(m.why));
-      else told(m);
+      if (m.kind === "progress") { now = m; at = performance.now(); draw(); } else if (m.kind === "end") m.how === "done" ? done() : fail(new Error(m.why)); else told(m);
     }));
-  } finally { line.remove(); refresh().catch(() => {}); }
+  } finally { clearInterval(beat); line.remove(); refresh().catch(() => {}); }
 }
 export function wrong(host) { return (error) => host.append(el("p", { className: "refused", role: "alert" }, error.message)); }
 
-function preview(file, detail) {
+function preview(file, detail, how = {}) {
   const host = el("div"), next = el("div");
   detail.append(host, next);
-  job({ job: "preview", record: file.number }, host, (m) => {
+  job({ job: "preview", record: file.number, ...how }, (m) => {
     if (m.kind === "note") host.append(el("p", { className: "caution" }, m.text));
     if (m.kind !== "preview") return;
     for (const c of m.channels) host.append(strip(`${c.name} [${c.unit}]`, m.t, c.low, c.high, 92).box);
-    host.append(el("pre", {}, m.text));
+    host.append(...sections(m.content));
     identifyForm(file, { ...m, file: file.name }, next);
-  }).catch(wrong(host));
+  }).catch((error) => { wrong(host)(error); readingForm(file, detail, next); });
 }
+function readingForm(file, detail, host) {  // what a record does not say by itself, or is to be read in spite of
+  const rate = el("input", { type: "number", min: 0, step: "any" }), gaps = el("select", {}, ...["error", "interpolate", "cut"].map((g) => el("option", {}, g)));
+  const again = () => { detail.replaceChildren(el("h2", {}, file.name)); preview(file, detail, { ...(rate.value && { rate_hz: Number(rate.value) }), gaps: gaps.value }); };
+  put(host, el("div", { className: "bar" }, el("label", {}, "Rate ", rate, " Hz"), el("label", {}, "Gaps ", gaps), el("button", { className: "go", onclick: again }, "Read again")));
+}
+const free = (base, ending) => { let name = base; for (let k = 2; state.files.some((f) => f.name === name + ending); k++) name = `${base}-${k}`; return name; };
 function identifyForm(file, m, host) {
   const rigs = state.files.filter((f) => f.kind === "rig");
   const rig = el("select", { name: "rig" }, el("option", { value: "" }, "draft one from this record"), ...rigs.map((f) => el("option", { value: f.number }, f.name)));
-  const draft = rigForm(m);
-  const out = el("input", { value: `${stem(file.name)}-estimate`, size: 24 });
+  const draft = rigForm(m, free(`${stem(file.name)}-rig`, ".toml"));
+  const out = el("input", { value: free(`${stem(file.name)}-estimate`, ".json"), size: 24 });
   const result = el("div");
   rig.onchange = () => { draft.box.hidden = rig.value !== ""; };
   const go = el("button", { className: "go", disabled: state.read_only, onclick: async () => {
-    result.replaceChildren();
+    put(result);
     go.disabled = true;
+    const ready = () => { go.disabled = state.read_only; out.value = free(`${stem(file.name)}-estimate`, ".json"); };
     try {
       let number = Number(rig.value);
       if (!number) {
         let name = "";
-        await job({ job: "rig", text: draft.text.value, out: draft.name.value }, result, (x) => { if (x.kind === "rig") name = x.name; });
+        await job({ job: "rig", text: draft.text.value, out: draft.name.value }, (x) => { if (x.kind === "rig") name = x.name; });
         await refresh();
         number = state.files.find((f) => f.name === name)?.number;
-        rig.append(el("option", { value: number }, name)); rig.value = number; draft.box.hidden = true;
+        rig.append(el("option", { value: number }, name)); rig.value = number; draft.box.hidden = true; draft.name.value = free(`${stem(file.name)}-rig`, ".toml");
       }
-      await job({ job: "identify", record: file.number, rig: number, out: out.value }, result, (x) => x.kind === "result" && results(x, result));
-    } catch (error) { wrong(result)(error); } finally { go.disabled = state.read_only; }
+      await job({ job: "identify", record: file.number, rig: number, out: out.value }, (x) => { results(x, result); if (x.kind === "result") go.disabled = state.read_only; });
+      await refresh();
+    } catch (error) { wrong(result)(error); } finally { ready(); }
   } }, "Identify");
-  host.replaceChildren(el("h2", {}, "Identify"), el("div", { className: "bar" }, el("label", {}, "Rig ", rig), el("label", {}, "Result ", out), go), draft.box, result);
+  put(host, el("h2", {}, "Identify"), el("div", { className: "bar" }, el("label", {}, "Rig ", rig), el("label", {}, "Result ", out), go), draft.box, result);
 }
-export async function results(m, host) {
-  await refresh();
-  const report = state.files.find((f) => f.name === m.report);
-  const head = el("h2", { className: `${m.verdict} result` }, WORDS[m.verdict] ?? m.verdict);
-  put(host, head, report ? link(report) : null, ...m.reasons.map((r) => el("p", {}, r)), ...(m.pictures ?? []).map(drawn), el("pre", {}, m.text));
-  head.scrollIntoView();
+// A result as soon as it is known; its report, with figures, as soon as that is drawn.
+export function results(m, host) {
+  if (m.kind === "result") {
+    put(host, ...verdict(m.content), el("p", { className: "report hint" }, `${m.name}.json is written; its report is being drawn.`), ...sections(m.content));
+    host.firstChild.scrollIntoView();
+  }
+  const place = host.querySelector(".report");
+  if (m.kind !== "report" || !place) return;
+  if (m.why) { place.textContent = m.why; place.className = "report caution"; return; }
+  refresh().then(() => { const report = state.files.find((f) => f.name === m.name); put(place, report ? link(report) : `${m.name} is written.`); }).catch(() => {});
+  place.after(...m.pictures.map(drawn));
 }

@@ -2,6 +2,7 @@
 import { $, date, el, put, shown, WORDS } from "./core.js";
 import { job, wrong } from "./files.js";
 import { chart, css, ink, line, upright } from "./plot.js";
+import { sections, verdict } from "./tables.js";
 
 const MARKS = { hidden: ["not identifiable", "--dim"], unusable: ["do not use", "--bad"] };
 function overTime(name, s, events, first, last) {
@@ -42,7 +43,7 @@ function overTime(name, s, events, first, last) {
 }
 function showHistory(m, host) {
   const first = m.estimates[0].taken_at, last = m.estimates.at(-1).taken_at, shownOnes = m.estimates.slice(-200).reverse();
-  put(host, el("h2", { className: `${m.verdict} result` }, `${m.bearing}: ${WORDS[m.verdict] ?? m.verdict}`), ...m.reasons.map((r) => el("p", {}, r)),
+  put(host, ...verdict(m.content, { head: `${m.bearing}: ${WORDS[m.content.verdict] ?? m.content.verdict}` }),
     m.left_out ? el("p", { className: "caution" }, `The latest ${m.estimates.length} estimates are drawn; 'ambid history' draws the ${m.left_out} before too.`) : null,
     el("p", { className: "hint" }, "Bands are 95 %. A point with caution is coloured; | not identifiable, × do not use: there no number is known. Drag over a chart to see it closer, a double click shows all. Times are UTC."),
     el("div", { id: "history-charts" }, ...Object.entries(m.series).map(([name, s]) => overTime(name, s, m.events, first, last))),
@@ -51,12 +52,12 @@ function showHistory(m, host) {
     el("h2", {}, m.estimates.length > 200 ? "The latest 200 estimates" : "Estimates"),
     el("div", { className: "scroll", tabIndex: 0 }, el("table", {}, el("thead", {}, el("tr", {}, ...["taken", "record", "verdict", "because of"].map((h) => el("th", {}, h)))),
       el("tbody", {}, ...shownOnes.map((e) => el("tr", {}, el("td", {}, date(e.taken_at, true)), el("td", { className: "name" }, e.record), el("td", { className: e.verdict }, WORDS[e.verdict] ?? e.verdict), el("td", {}, e.failed.replaceAll(",", ", "))))))),
-    el("details", {}, el("summary", {}, "As 'ambid history' writes it"), el("pre", {}, m.text)));
+    el("details", {}, el("summary", {}, "Changes and trends"), ...sections(m.content)));
 }
 export async function histories() {
   const form = $("history-form").elements, host = $("history-view"), asked = form.bearing.value;
   put(host);
-  await job({ job: "history", ledger: Number(form.ledger.value), ...(asked && { bearing: asked }) }, host, (m) => {
+  await job({ job: "history", ledger: Number(form.ledger.value), ...(asked && { bearing: asked }) }, (m) => {
     if (m.kind === "bearings") {
       put(form.bearing, ...m.names.map((n) => el("option", { selected: n === asked }, n)));
       if (!m.names.length) host.append(el("p", { className: "hint" }, "The ledger has no bearing yet."));

@@ -10,7 +10,7 @@ export async function refresh() {
   fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict, f.why]);
   fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
   for (const form of ["live-form", "commission-form"]) {
-    choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig"));
+    choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig" && (f.loop || form === "live-form")));
     for (const field of $(form).elements) field.disabled = state.read_only;
   }
   const bare = state.read_only ? "This console is read only: runs that others start are shown here." : state.files.some((f) => f.kind === "rig") ? "" : "There is no rig in this folder yet. Choose a record under Files: a rig is drafted from it, checked and written there. ";
@@ -18,7 +18,7 @@ export async function refresh() {
   choices($("history-form").elements.ledger, state.files.filter((f) => f.kind === "ledger"));
   $("history-form").hidden = !$("history-form").elements.ledger.value;
   $("history-hint").textContent = $("history-form").hidden ? "There is no ledger in this folder yet. 'ambid identify RECORD --ledger works.db' keeps each estimate in one; this page then shows what becomes of a bearing over months." : "";
-  choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig"), "none");
+  choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig" && f.loop), "none");
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
   $("stop").disabled = state.read_only;
   if (state.read_only) $("stop").title = "This console is read only: use the emergency stop";

@@ -5,6 +5,7 @@ import { refresh } from "./lists.js";
 import { BAND, chart, css, ink, line, narrow, pick, upright } from "./plot.js";
 import { orderWords, Watched } from "./run.js";
 import { banner, pose, question, stop } from "./stop.js";
+import { sections, verdict } from "./tables.js";
 
 const COLOURS = ["--accent", "--doubt", "--good", "--bad"];
 function decades(u, axis, low, high) {
@@ -31,7 +32,7 @@ export class Live extends Watched {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; }, header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
       event: () => { this.heard = true; this.event(m.t, m.what, m.why); }, told: () => this.before(m), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text), order: () => this.event(null, ...orderWords(m)),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
-      summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
+      summary: () => { put($("summary"), ...verdict(m.content), ...sections(m.content)); $("summary").hidden = false; },
       recorded: () => { this.sampled = Infinity; this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
       end: () => { $("state").textContent = m.how === "done" ? "over" : m.how === "lost" ? "broke off" : m.how; $("state").className = `badge ${m.how}`; if (m.why) this.event(null, m.how, m.why); refresh().catch(() => {}); } }[m.kind];
     how?.();
@@ -228,5 +229,5 @@ $("export").onclick = async () => {
   const host = el("div");
   $("events").prepend(host);
   const [from_s, to_s] = feed.marked;
-  await job({ job: "export", record: file.number, from_s, to_s, out: `${stem(file.name)}-${from_s.toFixed(2)}-${to_s.toFixed(2)}` }, host, (m) => m.kind === "exported" && feed.event(null, "exported", `${m.name}, ${m.samples} samples`)).catch(wrong(host));
+  await job({ job: "export", record: file.number, from_s, to_s, out: `${stem(file.name)}-${from_s.toFixed(2)}-${to_s.toFixed(2)}` }, (m) => m.kind === "exported" && feed.event(null, "exported", `${m.name}, ${m.samples} samples`)).catch(wrong(host));
 };

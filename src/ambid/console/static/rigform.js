@@ -1,9 +1,23 @@
 // A rig: channels and parameters as a form over the text that is checked and written.
-import { el, stem } from "./core.js";
+import { el } from "./core.js";
+import { parts } from "./tables.js";
 
-export function rigForm(m) {
+// A rig that is written, section by section.
+export function rigView(text) {
+  const shown = [];
+  for (const line of text.split("\n")) {
+    const head = line.match(/^\s*\[([^\]]+)\]\s*(#.*)?$/), entry = line.match(/^\s*([\w.]+)\s*=\s*([^#"]*(?:"[^"]*"[^#"]*)*)(#.*)?$/);
+    if (head || !shown.length) shown.push({ title: head?.[1] ?? "", rows: [] });
+    const rows = shown.at(-1).rows;
+    if (entry) rows.push([entry[1], entry[2].trim(), entry[3]?.slice(1).trim() ?? ""]);
+    else if (!head && line.trim() && !line.trim().startsWith("#") && rows.length) rows.at(-1)[1] += ` ${line.trim()}`;  // a list goes on
+  }
+  return [...shown.filter((s) => s.rows.length).flatMap((s) => [s.title ? el("h3", {}, s.title) : null, ...parts([{ kind: "table", content: [["", "", ""], ...s.rows] }])]).filter(Boolean),
+    el("details", {}, el("summary", {}, "The file itself"), el("textarea", { value: text, readOnly: true, spellcheck: false, "aria-label": "rig file" }))];
+}
+export function rigForm(m, free) {
   const text = el("textarea", { value: m.draft, spellcheck: false, "aria-label": "rig file" });
-  const name = el("input", { value: `${stem(m.file)}-rig`, size: 24 });
+  const name = el("input", { value: free, size: 24 });
   const fields = el("div", { className: "fields" });
   const rows = () => {
     fields.replaceChildren(...["", "value", "unit", "role", "sd, of a prior", ""].map((h, k) => el("span", { className: k < 5 ? "hint" : "about" }, h)));

@@ -1,6 +1,6 @@
 // Feeds: frames of a run, JSON ("J") and envelopes ("E").
-import { $, ask, OLD_S, PAGE, proven, SILENT_S, START_S } from "./core.js";
-import { banner, delivered, delivery, lookOld, trouble } from "./stop.js";
+import { ask, OLD_S, PAGE, proven, SILENT_S, START_S } from "./core.js";
+import { banner, confirmOff, delivered, lookOld, trouble } from "./stop.js";
 
 export function listen(id, told, envelope = () => {}, gone = () => {}) {
   const decoder = new TextDecoder(), path = `/api/runs/${id}/feed`;
@@ -36,10 +36,11 @@ export class Watched {
       this.last = performance.now(); this.began = true;
       if (m.kind === "beat") this.beat = m.n;
       if (m.kind === "lease") return this.leased(m);
-      if (m.kind === "stopping" && this.alive) delivered();  // not of a run that is over and shown again
+      if (m.kind === "stopping" && this.alive) delivered([this.id]);  // not of a run that is over and shown again
+      if (m.kind === "off" && this.alive) confirmOff([this.id]);
       if (m.kind === "end") { this.over = true; this.brokeOff = this.alive && m.how === "lost"; if (this.brokeOff) attached.delete(this.id); }
       this.tell(m);
-      if (m.kind === "end") { lookOld(); if (!this.brokeOff && $("delivery").className === "good") delivery($("delivery").textContent.replace(/:.*/, ": the run is over."), "good"); }
+      if (m.kind === "end") lookOld();
     }, (data, at) => this.envelope?.(data, at));
   }
   leased(m) {  // who may order

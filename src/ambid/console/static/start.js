@@ -44,8 +44,7 @@ function past(run) {
   show("files");
   let found = false;
   const socket = listen(run.id, (m) => {
-    if (m.kind === "result") { found = true; results(m, host); }
-    else if (m.kind === "preview") { found = true; put(host, el("pre", {}, m.text)); }
+    if (["result", "report"].includes(m.kind)) { found = true; results(m, host); }
     else if (m.kind === "end") { if (!found || m.why) host.append(el("p", { className: m.how }, m.why || m.how)); socket.close(); }
   });
 }

@@ -55,21 +55,37 @@ async function takeOver() {
   again();
 }
 
-// Stop: of any page, at any time. It says that the run took it, or within a second that it did not.
-const DELIVERY_MS = 850, ENDS_MS = 5000;
+// Stop: of any page, at any time. It says that the run took it, or within a second that it did not; and then that the device has confirmed that its output is off.
+const DELIVERY_MS = 850, OFF_MS = 2000;
 export let stop = null, presses = 0;  // `stop`: the one that is not delivered yet
-export function delivery(text, kind) { $("delivery").textContent = text; $("delivery").className = kind; $("delivery").hidden = !text; }
-export function delivered() {
+let taken = null;  // the one whose output is not off yet
+function delivery(text, kind) { $("delivery").textContent = text; $("delivery").className = kind; $("delivery").hidden = !text; }
+const since = (press) => seconds((performance.now() - press.began) / 1000);
+export function delivered(ids) {
   if (!stop) return;
-  delivery(`Stop delivered after ${seconds((performance.now() - stop.began) / 1000)}: the run ends, the output goes off.`, "good");
+  const own = taken = { ...stop, ids, words: `Stop delivered after ${since(stop)}` };
   clearTimeout(stop.timer); stop = null;
-  const own = presses;
-  setTimeout(() => ask("/api/state").then(({ runs }) => own === presses && runs.some((r) => r.alive && MOVING.includes(r.spec.job)) && delivery("The run took Stop, and has not ended yet. If the rotor still moves, use the emergency stop.", "bad")).catch(() => {}), ENDS_MS);
+  delivery(`${own.words}: the run ends, the output goes off.`, "good");
+  setTimeout(async function look() {
+    if (taken !== own) return;
+    const { runs } = await ask("/api/state", undefined, 1000).catch(() => ({ runs: [] })), told = runs.filter((r) => ids.includes(r.id));  // also of a run that this page does not show
+    if (taken !== own) return;
+    if (told.length && told.every((r) => r.off)) return confirmOff(ids);
+    const over = told.length && !told.some((r) => r.alive);
+    delivery(`The run ${over ? "is over" : "took Stop"}, and its device has not confirmed that its output is off. If the rotor still moves, use the emergency stop.`, "bad");
+    if (!over) setTimeout(look, 1000);
+  }, OFF_MS);
+}
+export function confirmOff(ids) {
+  delivered(ids);  // who is off has taken it
+  if (!taken) return;
+  delivery(`${taken.words}, output off after ${since(taken)}.`, "good");
+  taken = null;
 }
 export function stopAll() {
   presses++;
   if (question && !question.run) question.end(false);  // what is not begun does not begin
-  clearTimeout(stop?.timer);
+  clearTimeout(stop?.timer); taken = null;
   const own = stop = { began: performance.now() };
   const undelivered = (why) => { if (stop === own) delivery(`Stop NOT DELIVERED: use the emergency stop. ${why}; it is tried again.`, "bad"); };
   delivery("Stop: on its way.", "note");
@@ -80,7 +96,7 @@ export function stopAll() {
         const answer = await ask("/api/stop", {}, DELIVERY_MS - 20);
         if (stop !== own) return;
         if (!answer.runs.length) { clearTimeout(own.timer); stop = null; return delivery("Nothing to stop: no run of this folder moves anything. If something moves, use the emergency stop.", "note"); }
-        if (answer.delivered) return delivered();
+        if (answer.delivered) return delivered(answer.runs);
         undelivered("The run does not answer");
       } catch (error) { undelivered(error.message[0].toUpperCase() + error.message.slice(1)); }
       await new Promise((done) => setTimeout(done, 1000));
