@@ -1,4 +1,4 @@
-"""What a console does when it is abused: starts at once, double clicks, kills, freezes, Stop; counted.
+"""What a console does when it is abused: attacks, starts at once, double clicks, kills, freezes, Stop; counted.
 
 ``PYTHONPATH=. python bench/console_faults.py [TIMES [NAME...]]``. Benches are simulated; nothing is asserted.
 """
@@ -20,8 +20,9 @@ from typing import Any
 from ambid.console.feed import FeedReader
 from ambid.console.runs import Run, Runs
 from ambid.record import read_record
+from tests.console.attacks import SECRET, answer, attacks, everything, lay_out, planted, through
 from tests.console.browser import SIZES, Page, chromium
-from tests.console.pages import LIVE, console, over, pid_of, prototype_rig, until
+from tests.console.pages import LIVE, console, frames_of, over, pid_of, prototype_rig, told, until
 
 _PRESS = """(() => { let began = null; window.said = null; const host = $("delivery");
 for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, (e) => { began ??= e.timeStamp; }, true);
@@ -157,10 +158,31 @@ def stops(folder: Path, times: int) -> str:
     )
 
 
+def attacked(folder: Path, times: int) -> str:
+    """Attack a console that runs, once whatever `times` says, and the runs that it begins by what its folder holds."""
+    del times
+    shown = lay_out(folder)
+    over = Runs(shown).start({"job": "rig", "text": "no rig", "out": "new.toml"})
+    until(over)
+    with console(shown) as page:
+        before, made = everything(shown), dict(attacks(page.open(), over.id))
+        got = [name for name, raw in made.items() if through(answer(page, raw))]
+        changed, wishes = everything(shown) != before, list(planted(page))
+        for name, wish in wishes:
+            with page.feed(page.json("POST", "/api/runs", wish)["id"]) as feed:
+                frames = frames_of(feed)
+            right = told(frames, "end")[0]["how"] == "refused" and SECRET.decode() not in str(frames)
+            got += [] if right else [name]
+    return (
+        f"{len(made) + len(wishes)} attacks: {len(got)} got through{': ' if got else ''}{', '.join(got)}; "
+        f"the folder is {'CHANGED' if changed else 'unchanged'}"
+    )
+
+
 if __name__ == "__main__":
     number = int(sys.argv[1]) if sys.argv[1:] else 20
     names = sys.argv[2:]  # of those that are wanted; without any, all
-    for measure in (starts, clicks, kills, freezes, stops):
+    for measure in (attacked, starts, clicks, kills, freezes, stops):
         if names and measure.__name__ not in names:
             continue
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as made:

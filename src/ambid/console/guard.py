@@ -29,6 +29,7 @@ KEY = b"x-ambid-key"
 MOST_BYTES = 1 << 16  # of the body of a request
 BODY_S = 10.0  # in which it has to come
 MOST_HEADERS = 1 << 14
+_MOST_LINES = 100  # of them
 _SANDBOXED = "/reports/"
 _BARE = "/static/"  # holds nothing of the folder
 _CHANGES_NOTHING = "/api/previews"
@@ -87,8 +88,9 @@ class Guard:
 
     def _refusal(self, scope: Scope, headers: MutableMapping[bytes, bytes]) -> Response | None:
         """Return the answer to what is not let through; None where it is."""
-        if sum(len(name) + len(value) for name, value in scope["headers"]) > MOST_HEADERS:
-            return _no(431, "the head of the request is too long")
+        size = sum(len(name) + len(value) for name, value in scope["headers"])
+        if size > MOST_HEADERS or len(scope["headers"]) > _MOST_LINES or scope["http_version"] not in ("1.0", "1.1"):
+            return _no(431, "the head of the request is too long, or of another protocol")
         host, origin = headers.get(b"host", b"").decode("latin-1"), headers.get(b"origin", b"").decode("latin-1")
         if host not in self._hosts:
             return _no(421, "this console answers to its own address only. Open the link that it printed")
