@@ -14,16 +14,39 @@ export class Steps extends Watched {
     this.listen();
   }
   item(name) {
-    return this.items[name] ??= $("steps").appendChild(el("li", {}, el("strong", {}, name), " ", el("span", { className: "hint" }, "waits")));
+    return this.items[name] ??= $("steps").appendChild(el("li", {}, el("strong", {}, name), " ",
+      el("span", { className: "hint" }, "waits")));
   }
   note(name, text) { this.item(name).querySelector("span").textContent = text; }
   tell(m) {
     const how = {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
-      progress: () => this.at && !this.done.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
-      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), order: () => this.append(el("p", { className: m.done ? "hint" : "refused" }, orderWords(m).join(": "))), ask: () => this.question(m), stopping: () => this.at && !this.done.has(this.at) && this.note(this.at, "is being stopped"),
-      commissioned: () => { this.kept = true; const words = m.passed ? "Commissioned." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, `Verdict: ${WORDS[m.verdict].toLowerCase()}`)); this.append(el("p", {}, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); $("steps").lastChild.scrollIntoView({ block: "end" }); }).catch(() => {}); },
-      end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); const why = m.how === "cancelled" && this.kept ? `Stopped by the operator. The folder ${this.out} and its report keep what was found. To go on, start again with another folder: each step is done anew.` : m.why; if (why) this.append(el("p", { className: m.how, role: "alert" }, why)); refresh().catch(() => {}); },
+      progress: () => this.at && !this.done.has(this.at) && this.note(this.at,
+        `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
+      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)),
+        order: () => this.append(el("p", { className: m.done ? "hint" : "refused" }, orderWords(m).join(": "))),
+        ask: () => this.question(m), stopping: () => this.at && !this.done.has(this.at) && this.note(this.at, "is being stopped"),
+      commissioned: () => {
+        this.kept = true;
+        this.append(el("h2", { className: m.verdict }, `Verdict: ${WORDS[m.verdict].toLowerCase()}`));
+        for (const r of [m.passed ? "Commissioned." : `Ended early: ${m.reached}.`, ...m.reasons]) this.append(el("p", {}, r));
+        refresh().then(() => {
+          const f = state.files.find((x) => x.name === m.report);
+          if (f) this.append(link(f));
+          $("steps").lastChild.scrollIntoView({ block: "end" });
+        }).catch(() => {});
+      },
+      end: () => {
+        this.question({});
+        for (const name of Object.keys(this.items)) {
+          if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached");
+        }
+        const kept = `Stopped by the operator. The folder ${this.out} and its report keep what was found. `
+          + "To go on, start again with another folder: each step is done anew.";
+        const why = m.how === "cancelled" && this.kept ? kept : m.why;
+        if (why) this.append(el("p", { className: m.how, role: "alert" }, why));
+        refresh().catch(() => {});
+      },
     }[m.kind];
     how?.();
   }
@@ -31,9 +54,12 @@ export class Steps extends Watched {
   step(m) {
     this.done.add(m.name);
     const pictures = el("div", { className: "pictures" }, ...m.pictures.map(drawn));
-    put(this.item(m.name), el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
-      ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
-      m.parts.length ? el("details", {}, el("summary", {}, "table"), ...parts(m.parts)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
+    put(this.item(m.name), el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" },
+      m.passed ? "good enough" : "not good enough"),
+      ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)),
+        ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
+      m.parts.length ? el("details", {}, el("summary", {}, "table"), ...parts(m.parts)) : null,
+        m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
   }
   question(m) {  // for who may answer; what was answered elsewhere meanwhile is not answered again
     this.asked = m.what && !this.over ? m : null;
@@ -41,7 +67,8 @@ export class Steps extends Watched {
     if (this.asked) this.pose(m);
   }
   async pose(m) {
-    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go", { run: this, focus: false, closes: false });
+    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. `
+      + "Is the bench clear, and the emergency stop within reach?", "Go", { run: this, focus: false, closes: false });
     if (yes === null || this.asked !== m || this.over) return;
     if (!await this.order(yes ? "go" : "no", { number: m.number })) again();
   }

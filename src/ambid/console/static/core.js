@@ -7,7 +7,8 @@ const brought = location.hash.match(/^#key=([\w-]+)$/)?.[1];
 if (brought) { localStorage.ambidKey = brought; history.replaceState(null, "", "/"); }
 const KEY = localStorage.ambidKey ?? "-", bytesOf = (text) => new TextEncoder().encode(text);
 const signer = crypto.subtle.importKey("raw", bytesOf(KEY), { name: "HMAC", hash: "SHA-256" }, false, ["sign"]);
-export const proven = async (path) => `${path}?proof=${hex(await crypto.subtle.sign("HMAC", await signer, bytesOf(path)))}`;  // an address that the browser opens by itself
+// an address that the browser opens by itself
+export const proven = async (path) => `${path}?proof=${hex(await crypto.subtle.sign("HMAC", await signer, bytesOf(path)))}`;
 export const MOVING = ["live", "commission"], LATE_S = 0.2, SILENT_S = 1.5, START_S = 15, OLD_S = 2.0, SLOTS = 2000;
 export let state = { files: [], runs: [] };
 export const learn = (now) => { state = now; };
@@ -44,14 +45,16 @@ export function shown(value, unit, sd) {
   const digits = s ? Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(s)))) : Math.max(0, 3 - Math.floor(Math.log10(Math.abs(v) || 1)));
   return (s ? `${v.toFixed(digits)} ± ${s.toFixed(digits)}` : v.toFixed(Math.min(9, digits))) + (u ? ` ${u}` : "");
 }
-export const seconds = (s) => s < 1 ? `${(1000 * s).toFixed(s < 0.01 ? 1 : 0)} ms` : s < 120 ? `${s.toFixed(1)} s` : `${(s / 60).toFixed(1)} min`;
+export const seconds = (s) => s < 1 ? `${(1000 * s).toFixed(s < 0.01 ? 1 : 0)} ms` : s < 120 ? `${s.toFixed(1)} s`
+  : `${(s / 60).toFixed(1)} min`;
 
 // Asking the server.
 export async function ask(path, body, patience) {
   const how = body === undefined ? {} : { method: "POST", body: JSON.stringify(body), headers: { "content-type": "application/json" } };
   let answer;
   try {
-    answer = await fetch(path, { ...how, signal: patience && AbortSignal.timeout(patience), headers: { ...how.headers, "x-ambid": PAGE, "x-ambid-key": KEY } });
+    answer = await fetch(path, { ...how, signal: patience && AbortSignal.timeout(patience),
+      headers: { ...how.headers, "x-ambid": PAGE, "x-ambid-key": KEY } });
     gone = false;
   } catch { gone = true; dispatchEvent(new Event("silent")); throw new Error("the console does not answer"); }
   const found = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : { error: (await answer.text()).trim() };
@@ -60,7 +63,10 @@ export async function ask(path, body, patience) {
 }
 export let gone = false;  // whether the console itself is silent
 
-export const when = (s) => { const d = new Date(1000 * s); return d.toDateString() === new Date().toDateString() ? d.toTimeString().slice(0, 8) : d.toISOString().slice(0, 10); };
+export const when = (s) => {
+  const d = new Date(1000 * s);
+  return d.toDateString() === new Date().toDateString() ? d.toTimeString().slice(0, 8) : d.toISOString().slice(0, 10);
+};
 export const date = (s, long) => new Date(1000 * s).toISOString().slice(0, long ? 16 : 10).replace("T", " ");
 export const stamp = () => new Date().toISOString().slice(0, 19).replace(/[-:]/g, "").replace("T", "-");
 export const stem = (name) => name.split("/").pop().replace(/\.(csv|csv\.gz|h5|hdf5|mat|json|toml|html)$/i, "");
@@ -70,7 +76,9 @@ export const WORDS = { usable: "Usable", caution: "Use with caution", unusable: 
 // Tabs.
 export function show(tab) {
   for (const section of document.querySelectorAll(".tab")) section.hidden = section.id !== tab;
-  for (const button of $("tabs").children) { button.ariaSelected = button.dataset.tab === tab; button.tabIndex = button.dataset.tab === tab ? 0 : -1; }
+  for (const button of $("tabs").children) {
+    button.ariaSelected = button.dataset.tab === tab; button.tabIndex = button.dataset.tab === tab ? 0 : -1;
+  }
   location.hash = tab;
   dispatchEvent(new Event("resize"));
 }

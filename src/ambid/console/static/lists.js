@@ -4,20 +4,33 @@ import { choose } from "./files.js";
 import { attached } from "./run.js";
 import { watch } from "./start.js";
 
+const NEXT = {
+  live: "Choose a rig and a port, then 'Record and track': simulated is a bench of this machine, replay:NAME a record of the folder, "
+    + "anything else the controller's serial port. Signals, parameters and events appear here.",
+  commission: "Choose a rig with [loop] and [daq], and a port, then 'Commission': self-test, rest, polarity, levitation, excitation, "
+    + "record, identification, validation and tracking follow one another; the page asks before the output is switched on.",
+};
 export async function refresh() {
   learn({ ...await ask("/api/state"), at: performance.now() });
-  $("where").textContent = state.folder + (state.read_only ? " (read only)" : "") + (state.left_out ? `, ${state.left_out} older files not shown` : "");
-  fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict, f.why]);
-  fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
+  $("where").textContent = state.folder + (state.read_only ? " (read only)" : "")
+    + (state.left_out ? `, ${state.left_out} older files not shown` : "");
+  fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind,
+    f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict, f.why]);
+  fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`,
+    r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
   for (const form of ["live-form", "commission-form"]) {
     choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig" && (f.loop || form === "live-form")));
     for (const field of $(form).elements) field.disabled = state.read_only;
   }
-  const bare = state.read_only ? "This console is read only: runs that others start are shown here." : state.files.some((f) => f.kind === "rig") ? "" : "There is no rig in this folder yet. Choose a record under Files: a rig is drafted from it, checked and written there. ";
-  for (const [of, next] of [["live", "Choose a rig and a port, then 'Record and track': simulated is a bench of this machine, replay:NAME a record of the folder, anything else the controller's serial port. Signals, parameters and events appear here."], ["commission", "Choose a rig with [loop] and [daq], and a port, then 'Commission': self-test, rest, polarity, levitation, excitation, record, identification, validation and tracking follow one another; the page asks before the output is switched on."]]) $(`${of}-hint`).textContent = state.read_only ? bare : bare + next;
+  const bare = state.read_only ? "This console is read only: runs that others start are shown here."
+    : state.files.some((f) => f.kind === "rig") ? ""
+    : "There is no rig in this folder yet. Choose a record under Files: a rig is drafted from it, checked and written there. ";
+  for (const [of, next] of Object.entries(NEXT)) $(`${of}-hint`).textContent = state.read_only ? bare : bare + next;
   choices($("history-form").elements.ledger, state.files.filter((f) => f.kind === "ledger"));
   $("history-form").hidden = !$("history-form").elements.ledger.value;
-  $("history-hint").textContent = $("history-form").hidden ? "There is no ledger in this folder yet. 'ambid identify RECORD --ledger works.db' keeps each estimate in one; this page then shows what becomes of a bearing over months." : "";
+  $("history-hint").textContent = $("history-form").hidden
+    ? "There is no ledger in this folder yet. 'ambid identify RECORD --ledger works.db' keeps each estimate in one; "
+      + "this page then shows what becomes of a bearing over months." : "";
   choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig" && f.loop), "none");
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
   $("stop").disabled = state.read_only;
@@ -32,7 +45,8 @@ function fill(body, things, cells, chosen, key) {
   const held = body.contains(document.activeElement);
   body.replaceChildren(...things.map((thing) => {
     const pick = () => chosen(thing);
-    const row = el("tr", { tabIndex: -1, "data-of": key(thing)[0], onclick: () => { rove(row); pick(); }, onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
+    const row = el("tr", { tabIndex: -1, "data-of": key(thing)[0], onclick: () => { rove(row); pick(); },
+      onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
     row.append(...cells(thing).map((c, k) => el("td", { className: k ? (c === thing.verdict ? thing.verdict : "") : "name" }, String(c))));
     if (thing.why) (thing.kind ? row.firstChild : row.lastChild).append(el("div", { className: "hint why", title: thing.why }, thing.why));
     return row;
@@ -59,6 +73,7 @@ function choices(select, files, none) {
   if (select.dataset.key === text) return;
   const before = select.value;
   select.dataset.key = text;
-  select.replaceChildren(...(none ? [el("option", { value: "" }, none)] : []), ...files.map((f) => el("option", { value: f.number }, f.name)));
+  select.replaceChildren(...(none ? [el("option", { value: "" }, none)] : []),
+    ...files.map((f) => el("option", { value: f.number }, f.name)));
   if ([...select.options].some((o) => o.value === before)) select.value = before;
 }

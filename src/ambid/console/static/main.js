@@ -14,12 +14,19 @@ function colours() {
 }
 
 $("theme").value = document.cookie.match(/(?:^|; )ambid_colours=(light|dark)/)?.[1] ?? "";
-$("theme").onchange = () => { document.cookie = `ambid_colours=${$("theme").value}; SameSite=Strict; path=/; max-age=31536000`; colours(); };
+$("theme").onchange = () => {
+  document.cookie = `ambid_colours=${$("theme").value}; SameSite=Strict; path=/; max-age=31536000`; colours();
+};
 dark.addEventListener("change", colours);
 colours();
 if (["files", "live", "commission", "history"].includes(location.hash.slice(1))) show(location.hash.slice(1));
 refresh().catch(trouble);
 let listing = false;  // one at a time: a browser asks six things of a server at once, and Stop does not queue behind them
-setInterval(() => { if (!document.hidden && !listing) { listing = true; refresh().catch(() => {}).finally(() => { listing = false; }); } }, 2000);
+setInterval(() => {
+  if (document.hidden || listing) return;
+  listing = true;
+  refresh().catch(() => {}).finally(() => { listing = false; });
+}, 2000);
 setInterval(lookOld, 250);
-window.ambidConsole = { $, refresh, show, stopAll, watch, get feed() { return feed; }, get state() { return state; } };  // for tests and the curious
+// for tests and the curious
+window.ambidConsole = { $, refresh, show, stopAll, watch, get feed() { return feed; }, get state() { return state; } };

@@ -23,14 +23,19 @@ function axes(unit, more = {}) {
     while (digits < 9 && splits.some((s) => Math.abs(+(s / p).toFixed(digits) * p - s) > 1e-3 * gap)) digits++;
     return splits.map((s, k) => (s / p).toFixed(digits) + (k === splits.length - 1 && name ? ` ${name}` : ""));
   };
-  return [{ stroke: ink("--dim"), grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
+  return [{ stroke: ink("--dim"), grid, ticks: grid, size: 26,
+    values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
           { stroke: ink("--dim"), grid, ticks: grid, size: room, space: 15, values: label, ...(more.yaxis ?? {}) }];
 }
 export function chart(title, height, series, unit, more = {}) {
   const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
-  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, ...(more.utc ? { padding: [null, 56, null, null], tzDate: (s) => uPlot.tzDate(new Date(1000 * s), "UTC") } : {}), cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
+  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more),
+    scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) },
+    ...(more.utc ? { padding: [null, 56, null, null], tzDate: (s) => uPlot.tzDate(new Date(1000 * s), "UTC") } : {}),
+    cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
   const plot = new uPlot(opts, [[], ...series.map(() => [])], host);
-  new ResizeObserver(() => host.clientWidth > 50 && Math.abs(host.clientWidth - plot.width) > 1 && plot.setSize({ width: host.clientWidth, height })).observe(host);
+  new ResizeObserver(() => host.clientWidth > 50 && Math.abs(host.clientWidth - plot.width) > 1
+    && plot.setSize({ width: host.clientWidth, height })).observe(host);
   const made = { box, plot, value };
   for (const old of plots) if (!old.box.isConnected) plots.delete(old);
   setTimeout(() => plots.add(made));
@@ -42,7 +47,8 @@ export function strip(title, t, low, high, height = 110, unit = title.match(/\[(
   const made = chart(title, height, BAND(), unit, { bands: [{ series: [2, 1], fill: ink("--accent", "66") }], zoom: true });
   made.plot.setData([t, low, high]);
   const known = [...low, ...high].filter((v) => v !== null);
-  if (known.length) made.value.textContent = `${shown(known.reduce((a, b) => Math.min(a, b)), unit)} to ${shown(known.reduce((a, b) => Math.max(a, b)), unit)}`;
+  if (known.length) made.value.textContent = `${shown(known.reduce((a, b) => Math.min(a, b)), unit)} to ${shown(
+    known.reduce((a, b) => Math.max(a, b)), unit)}`;
   return made;
 }
 
@@ -54,6 +60,7 @@ export function upright(u, x, colour, text = "", dash = []) {
 }
 export function pick(values, a, z, step, of) {
   const found = [];
-  for (let k = a; k < z; k += step) { const part = values.slice(k, Math.min(z, k + step)).filter((x) => x !== null); found.push(part.length ? of(part) : null); }
+  for (let k = a; k < z; k += step) { const part = values.slice(k, Math.min(z, k + step)).filter((x) => x !== null);
+    found.push(part.length ? of(part) : null); }
   return found;
 }

@@ -7,6 +7,7 @@ import { Live } from "./live.js";
 import { attached, listen } from "./run.js";
 import { again, banner, confirmed, lookOld, presses, stopAll, trouble } from "./stop.js";
 
+const FILES = ["rig", "estimate", "arm"];
 let starting = false;
 async function begin(form, spec) {
   if (starting) return;
@@ -14,17 +15,20 @@ async function begin(form, spec) {
   try {
     for (const [name, field] of Object.entries(Object.fromEntries([...form.elements].filter((f) => f.name).map((f) => [f.name, f])))) {
       if (field.type === "checkbox") spec[name] = field.checked;
-      else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate", "arm"].includes(name) ? Number(field.value) : field.value;
+      else if (field.value !== "") spec[name] = field.type === "number" || FILES.includes(name) ? Number(field.value) : field.value;
     }
     const moves = spec.port !== "simulated" && !spec.port.startsWith("replay:");
-    if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
-    if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, and return to its own where the rotor moves too far. Load it?", "Load")) return;
+    if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. `
+      + "Is the bench clear, and the emergency stop within reach?", "Start")) return;
+    if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, "
+      + "and return to its own where the rotor moves too far. Load it?", "Load")) return;
     const before = presses, { id } = await ask("/api/runs", { ...spec, now: state.now + (performance.now() - state.at) / 1000 });
     if (presses !== before) stopAll();  // pressed while the run was about to begin
     banner(""); attached.add(id);
     await refresh();
     watch({ id, spec, alive: true, you: true });
-  } catch (error) { trouble(error); refresh().catch(() => {}); } finally { starting = false; again(); }  // another run may have come first: it is shown
+  // another run may have come first: it is shown
+  } catch (error) { trouble(error); refresh().catch(() => {}); } finally { starting = false; again(); }
 }
 $("live-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "live", pace: "real-time" }); });
 $("commission-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "commission" }); });

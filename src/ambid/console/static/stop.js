@@ -15,12 +15,18 @@ export function lookOld() {
   const run = feed && !feed.over && !feed.brokeOff ? feed : null;
   run?.socket?.live();
   const other = run?.holder && !run.you ? run.holder : "";
-  const not = state.read_only ? "this console is read only" : other ? `${other} has the right to order this run` : why && "what is shown is old";
-  const tracked = not || (feed?.job !== "live" ? "no live run is shown" : !run ? "the run is over" : !feed.following ? "nothing is tracked now" : "");
-  for (const button of document.querySelectorAll("[data-say]")) { button.disabled = tracked !== ""; button.title = tracked && `Not now: ${tracked}`; }
+  const not = state.read_only ? "this console is read only" : other ? `${other} has the right to order this run`
+    : why && "what is shown is old";
+  const tracked = not || (feed?.job !== "live" ? "no live run is shown" : !run ? "the run is over"
+    : !feed.following ? "nothing is tracked now" : "");
+  for (const button of document.querySelectorAll("[data-say]")) {
+    button.disabled = tracked !== ""; button.title = tracked && `Not now: ${tracked}`;
+  }
   if (question?.run) { question.old = question.run !== run ? "The run is over." : not && `Not now: ${not}.`; refuse(); }
   const driver = !run ? "" : other ? `${other} orders the run ` : run.you ? "this page orders the run" : "no page orders the run";
-  if ($("driver").firstChild?.textContent !== driver) put($("driver"), driver, other && !state.read_only ? el("button", { onclick: takeOver }, "Take over") : null);  // a button that is replaced cannot be clicked
+  // a button that is replaced cannot be clicked
+  if ($("driver").firstChild?.textContent !== driver) put($("driver"), driver,
+    other && !state.read_only ? el("button", { onclick: takeOver }, "Take over") : null);
   for (const job of MOVING) $(`${job}-form`).hidden = !!run && run.job === job && run.alive;  // one run at a time
 }
 addEventListener("silent", lookOld);
@@ -28,10 +34,16 @@ export const trouble = (error) => banner(error.message, "note");
 
 // Questions: a panel beside what is shown. Nothing lies over Stop, and the page goes on.
 export let question = null;  // the one that is open
-export function pose(content, { yes = "Yes", run = null, focus = true, closes = true } = {}) {  // whether it is agreed to; null: another question came
+// whether it is agreed to; null: another question came
+export function pose(content, { yes = "Yes", run = null, focus = true, closes = true } = {}) {
   question?.end(null);
   return new Promise((resolve) => {
-    const own = question = { run, closes, old: "", not: "", draw: () => { put($("question"), ...content()); refuse(); }, end: (answer) => { if (question !== own) return; question = null; $("ask").hidden = true; document.body.classList.remove("asking"); resolve(answer); } };
+    const own = question = { run, closes, old: "", not: "", draw: () => { put($("question"), ...content()); refuse(); },
+      end: (answer) => {
+        if (question !== own) return;
+        question = null; $("ask").hidden = true; document.body.classList.remove("asking");
+        resolve(answer);
+      } };
     $("yes").textContent = yes;
     own.draw();
     $("ask").hidden = false; document.body.classList.add("asking");
@@ -51,43 +63,49 @@ export const confirmed = (text, yes, more = {}) => pose(() => [el("p", {}, text)
 
 async function takeOver() {
   const run = feed;
-  if (await confirmed(`${run.holder} orders the run. Take over? It is told so.`, "Take over")) await ask("/api/drive", { run: run.id }).then((m) => run.leased(m)).catch(trouble);
+  if (await confirmed(`${run.holder} orders the run. Take over? It is told so.`, "Take over")) {
+    await ask("/api/drive", { run: run.id }).then((m) => run.leased(m)).catch(trouble);
+  }
   again();
 }
 
-// Stop: of any page, at any time. It says that the run took it, or within a second that it did not; and then that the device has confirmed that its output is off.
+// Stop: of any page, at any time. It says that the run took it, or within a second that it did not; and then that the device has
+// confirmed that its output is off.
 const DELIVERY_MS = 850, OFF_MS = 2000;
 export let stop = null, presses = 0;  // `stop`: the one that is not delivered yet
-let taken = null;  // the one whose output is not off yet
+let halt = null;  // the one whose output is not off yet
 function delivery(text, kind) { $("delivery").textContent = text; $("delivery").className = kind; $("delivery").hidden = !text; }
 const since = (press) => seconds((performance.now() - press.began) / 1000);
 export function delivered(ids) {
   if (!stop) return;
-  const own = taken = { ...stop, ids, words: `Stop delivered after ${since(stop)}` };
+  const own = halt = { ...stop, ids, words: `Stop delivered after ${since(stop)}` };
   clearTimeout(stop.timer); stop = null;
   delivery(`${own.words}: the run ends, the output goes off.`, "good");
   setTimeout(async function look() {
-    if (taken !== own) return;
-    const { runs } = await ask("/api/state", undefined, 1000).catch(() => ({ runs: [] })), told = runs.filter((r) => ids.includes(r.id));  // also of a run that this page does not show
-    if (taken !== own) return;
-    if (told.length && told.every((r) => r.off)) return confirmOff(ids);
-    const over = told.length && !told.some((r) => r.alive);
-    delivery(`The run ${over ? "is over" : "took Stop"}, and its device has not confirmed that its output is off. If the rotor still moves, use the emergency stop.`, "bad");
+    if (halt !== own) return;
+    const { runs } = await ask("/api/state", undefined, 1000).catch(() => ({ runs: [] }));  // also of one that this page does not show
+    if (halt !== own) return;
+    const those = runs.filter((r) => ids.includes(r.id)), over = those.length && !those.some((r) => r.alive);
+    if (those.length && those.every((r) => r.off)) return confirmOff(ids);
+    delivery(`The run ${over ? "is over" : "took Stop"}, and its device has not confirmed that its output is off. `
+      + "If the rotor still moves, use the emergency stop.", "bad");
     if (!over) setTimeout(look, 1000);
   }, OFF_MS);
 }
 export function confirmOff(ids) {
   delivered(ids);  // who is off has taken it
-  if (!taken) return;
-  delivery(`${taken.words}, output off after ${since(taken)}.`, "good");
-  taken = null;
+  if (!halt) return;
+  delivery(`${halt.words}, output off after ${since(halt)}.`, "good");
+  halt = null;
 }
 export function stopAll() {
   presses++;
   if (question && !question.run) question.end(false);  // what is not begun does not begin
-  clearTimeout(stop?.timer); taken = null;
+  clearTimeout(stop?.timer); halt = null;
   const own = stop = { began: performance.now() };
-  const undelivered = (why) => { if (stop === own) delivery(`Stop NOT DELIVERED: use the emergency stop. ${why}; it is tried again.`, "bad"); };
+  const undelivered = (why) => {
+    if (stop === own) delivery(`Stop NOT DELIVERED: use the emergency stop. ${why}; it is tried again.`, "bad");
+  };
   delivery("Stop: on its way.", "note");
   own.timer = setTimeout(() => undelivered("There is no answer"), DELIVERY_MS);
   (async () => {
@@ -95,7 +113,10 @@ export function stopAll() {
       try {
         const answer = await ask("/api/stop", {}, DELIVERY_MS - 20);
         if (stop !== own) return;
-        if (!answer.runs.length) { clearTimeout(own.timer); stop = null; return delivery("Nothing to stop: no run of this folder moves anything. If something moves, use the emergency stop.", "note"); }
+        if (!answer.runs.length) {
+          clearTimeout(own.timer); stop = null;
+          return delivery("Nothing to stop: no run of this folder moves anything. If something moves, use the emergency stop.", "note");
+        }
         if (answer.delivered) return delivered(answer.runs);
         undelivered("The run does not answer");
       } catch (error) { undelivered(error.message[0].toUpperCase() + error.message.slice(1)); }
