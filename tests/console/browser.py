@@ -25,7 +25,9 @@ _PLACE = """((of) => {
   const one = typeof of === "string" ? document.querySelector(of) : of;
   if (!one || one.disabled) return null;
   let box = one.getBoundingClientRect();
-  if (box.top < 0 || box.bottom > innerHeight) one.scrollIntoView({ block: "center" });
+  const head = document.querySelector("header");
+  const below = head && !head.contains(one) ? head.getBoundingClientRect().bottom : 0;
+  if (box.top < below || box.bottom > innerHeight) one.scrollIntoView({ block: "center" });
   box = one.getBoundingClientRect();
   const x = box.left + box.width / 2, y = box.top + box.height / 2, top = document.elementFromPoint(x, y);
   return box.width && top && (one === top || one.contains(top)) ? [x, y] : null;
@@ -58,6 +60,17 @@ class Page:
             assert time.monotonic() < end, f"{script}: {self.evaluate('document.body.innerText')[-1500:]}"
             time.sleep(0.02)
         return value
+
+    def tabs(self):
+        """The pages that are open."""
+        return [t for t in self._browser.send("Target.getTargets")["targetInfos"] if t["type"] == "page"]
+
+    def wait(self, holds, seconds=10.0):
+        """Wait until something that is no expression of the page holds."""
+        end = time.monotonic() + seconds
+        while not holds():
+            assert time.monotonic() < end
+            time.sleep(0.02)
 
     def goto(self, link):
         self.send("Page.navigate", url=link)

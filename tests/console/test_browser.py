@@ -9,9 +9,11 @@ import sys
 
 import pytest
 
+from ambid import simulate
 from ambid.console.runs import Runs
 from ambid.job import identify, load
 from ambid.physics.presets import preset
+from ambid.record import write_record
 from ambid.rig import preset_text
 from tests.console.browser import NEEDED, chromium
 from tests.console.pages import console, prototype_rig
@@ -23,9 +25,6 @@ LONG_S = 90.0
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    from ambid import simulate
-    from ambid.record import write_record
-
     made = tmp_path_factory.mktemp("page")
     prototype_rig(made)
     write_record(simulate("thesis", duration=0.5, seed=1), made / "rec.csv")
@@ -39,6 +38,10 @@ def page(folder):
         yield opened
         assert opened.wrong == []
 
+
+# rows of tables: name, meaning, and the other cells
+ROWS = """[...document.querySelectorAll("#detail .table tbody tr")].map((r) => [r.firstChild.firstChild.textContent,
+r.firstChild.title, ...[...r.children].slice(1).map((c) => c.textContent)])"""
 
 # whether the first strip has a colour
 DRAWN = """((colour) => {
@@ -57,12 +60,81 @@ def test_a_record_becomes_an_estimate(page, folder):
     assert page.evaluate("document.activeElement.rowIndex") == page.count("#list tbody tr")
     page.click(page.with_text("#list tr", "rec.csv"))
     page.click(page.with_text("#detail button", "Identify"))
+    assert page.evaluate("$('work').getBoundingClientRect().bottom <= innerHeight")  # wherever the form was
     page.until("document.querySelector('#detail h2:is(.usable, .caution, .unusable)')", LONG_S)
-    assert page.count(f"#detail h2.{load(folder / 'rec-estimate.json').verdict.word}") == 1
+    assert page.text("#detail .report") == "rec-estimate.json is written; its report is being drawn."
+    assert page.count("#detail .report a") == 0
+    found = load(folder / "rec-estimate.json")
+    assert page.count(f"#detail h2.{found.verdict.word}") == 1
+    row = page.evaluate(f"{ROWS}.find((r) => r[0] === 'R')")
+    assert row[1].startswith("coil resistance")  # where the pointer rests
+    assert row[2:] == ["free", *row[3:6], "identified"]
+    assert float(row[3].split(" ± ")[0]) == pytest.approx(found["R"].value, rel=1e-3)
+    assert row[4].endswith(" ohm")
+    assert "± is one standard deviation; intervals and bands are 95 %" in page.text("#detail")
     assert (folder / "rec-rig.toml").exists()
-    address = page.until("document.querySelector('#detail a[href*=proof]')?.href")
+    address = page.until("document.querySelector('#detail .report a[href*=proof]')?.href", LONG_S)
     assert page.evaluate(f"fetch({json.dumps(address)}).then((a) => a.status)") == 200
     assert page.wide() == 0
+    page.until("!$('work').childElementCount")
+    page.click(page.with_text("#detail button", "Identify"))  # again: under the next name, and with the time left
+    page.with_text("#work", "left", LONG_S)
+    page.with_text("#detail .report", "rec-estimate-2", LONG_S)
+    page.until("document.querySelector('#detail .report a') && !$('work').childElementCount", LONG_S)
+    assert page.count("pre") == 0
+
+
+def test_what_lies_in_the_folder_is_opened_by_a_click(page, folder):
+    page.until("state.files.some((f) => f.name === 'rec-estimate.html')", LONG_S)
+    page.click(page.with_text("#list tr", "rec-estimate.json"))
+    page.with_text("#detail h2", "What it says", LONG_S)
+    assert page.evaluate(f"{ROWS}.map((r) => r[0]).includes('k_x')")
+    page.with_text("#detail .hint", "A design writes a rig")
+    assert page.evaluate("[...document.querySelectorAll('#detail select option')].map((o) => o.text)[0]") == "rig.toml"
+    rig = "([...document.querySelectorAll('#list tr')].find((r) => r.cells[0].textContent === 'rig.toml'))"
+    page.click(rig)
+    page.with_text("#detail h3", "channels.position")
+    assert page.evaluate(f"{ROWS}.some((r) => r[0] === 'kp' && r[2] === '19415.0')")
+    before = len(page.tabs())
+    page.click(page.with_text("#list tr", "rec-estimate.html"))
+    page.with_text("#detail a", "Open rec-estimate.html")
+    page.wait(lambda: len(page.tabs()) == before + 1)
+    page.send("Page.bringToFront")
+    assert page.count("pre") == 0
+
+
+def test_the_loop_of_an_estimate_is_judged_and_a_better_one_designed(page, folder):
+    (folder / "axis.toml").write_text(preset_text(preset("rmit-axis")), encoding="utf-8")
+    write_record(simulate("rmit-axis", duration=0.5, seed=1), folder / "axis.csv")
+    identify(folder / "axis.csv", folder / "axis.toml").save(folder / "axis-known.json")
+    page.until("state.files.some((f) => f.name === 'axis-known.json')", LONG_S)
+    page.click(page.with_text("#list tr", "axis-known.json"))
+    rigs = "[...document.querySelector('#detail select').options].find((o) => o.text === 'axis.toml')"
+    page.until(rigs)
+    page.evaluate(f"document.querySelector('#detail select').value = {rigs}.value")
+    page.click(page.with_text("#detail button", "Margins"))
+    page.with_text("#detail .report", "axis-known-margins", LONG_S)
+    assert page.evaluate(f"{ROWS}.some((r) => r[2]?.endsWith(' dB'))")
+    page.until("document.querySelector('#detail .report a') && document.querySelector('#detail img')", LONG_S)
+    page.until("!$('work').childElementCount", LONG_S)
+    page.click(page.with_text("#detail button", "Design a better loop"))
+    page.with_text("#detail .report", "axis-known-design", 2 * LONG_S)
+    page.until("document.querySelector('#detail .report a')", 2 * LONG_S)
+    page.with_text("#list tr", "axis-known-design.toml")
+    assert page.count("pre") == 0
+    assert page.wide() == 0
+
+
+def test_a_record_without_time_is_read_with_a_rate(page, folder):
+    lines = (folder / "rec.csv").read_text(encoding="utf-8").splitlines()
+    head = next(k for k, x in enumerate(lines) if x.startswith("time"))
+    (folder / "untimed.csv").write_text("\n".join(x.partition(",")[2] for x in lines[head:]), encoding="utf-8")
+    page.click(page.with_text("#list tr", "untimed.csv"))
+    page.with_text("#detail .refused", "Add the column, or give Rate", LONG_S)
+    page.put("#detail input[type=number]", "5000")
+    page.click(page.with_text("#detail button", "Read again"))
+    page.with_text("#detail button", "Identify", LONG_S)
+    assert "rate_hz = 5000" in page.evaluate("document.querySelector('#detail textarea').value")
 
 
 def test_a_live_bench_is_watched_held_frozen_and_stopped(page, folder):
@@ -179,5 +251,5 @@ def test_commissioning_asks_and_ends_with_its_report(page, folder, port):
     page.with_text("#steps a", "report.html", 3 * LONG_S)
     assert page.count("#steps > li .usable") >= 7
     assert "null" not in page.text("#steps")
-    assert page.evaluate("!$('commission-form').hidden")  # which gave its room while it ran
+    page.until("!$('commission-form').hidden")  # which gave its room while it ran
     assert (folder / port / "report.html").exists()

@@ -10,7 +10,8 @@ function table({ content: [labels, ...rows], right = [], about = null }) {
     return el("th", { scope: "row", title: means, className: means && "meant" }, textOf(row[0]),
       means ? el("span", { className: "means hint" }, means) : null);
   };
-  const value = (cell, k) => el("td", { className: `${side(k)} ${styleOf(cell)} ${textOf(cell).length < 30 ? "short" : ""}` }, textOf(cell));
+  const look = (cell, k) => `${side(k)} ${styleOf(cell)} ${textOf(cell).length < 30 ? "short" : ""}`;
+  const value = (cell, k) => el("td", { className: look(cell, k) }, textOf(cell));
   const head = el("thead", {}, el("tr", {}, ...columns.map((k) => el("th", { scope: "col", className: side(k) }, textOf(labels[k])))));
   const body = el("tbody", {}, ...rows.map((row) => el("tr", {}, ...columns.map((k) => k ? value(row[k], k) : name(row)))));
   return el("div", { className: "table", tabIndex: 0 }, el("table", {}, labels.some(textOf) ? head : null, body));
