@@ -15,7 +15,7 @@ from ambid.job import identify, load
 from ambid.physics.presets import preset
 from ambid.record import write_record
 from ambid.rig import preset_text
-from tests.console.browser import NEEDED, chromium
+from tests.console.browser import NEEDED, SIZES, chromium
 from tests.console.pages import console, prototype_rig
 
 pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
@@ -87,7 +87,7 @@ def test_a_record_becomes_an_estimate(page, folder):
 def test_what_lies_in_the_folder_is_opened_by_a_click(page, folder):
     page.until("state.files.some((f) => f.name === 'rec-estimate.html')", LONG_S)
     page.click(page.with_text("#list tr", "rec-estimate.json"))
-    page.with_text("#detail h2", "What it says", LONG_S)
+    page.with_text("#detail h2.result", "Usable", LONG_S)
     assert page.evaluate(f"{ROWS}.map((r) => r[0]).includes('k_x')")
     page.with_text("#detail .hint", "A design writes a rig")
     assert page.evaluate("[...document.querySelectorAll('#detail select option')].map((o) => o.text)[0]") == "rig.toml"
@@ -248,8 +248,71 @@ def test_commissioning_asks_and_ends_with_its_report(page, folder, port):
         os.kill(number, signal.SIGCONT)
     page.until("$('banner').hidden")
     page.click("#yes")
+    page.with_text("#work", "of 9", LONG_S)  # in view, of the whole run
     page.with_text("#steps a", "report.html", 3 * LONG_S)
     assert page.count("#steps > li .usable") >= 7
     assert "null" not in page.text("#steps")
-    page.until("!$('commission-form').hidden")  # which gave its room while it ran
+    assert page.evaluate("[...document.querySelectorAll('#steps td')].some((c) => / dB$/.test(c.textContent))")
+    assert page.count("pre") == 0
+    page.until("!$('commission-form').hidden && !$('work').childElementCount")  # which gave its room while it ran
     assert (folder / port / "report.html").exists()
+
+
+# texts that stand out too little from what is behind them, with the ratio of WCAG 2.2
+FAINT = """(() => {
+  const light = (c) => c.map((v) => v / 255).map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + [0.2126, 0.7152, 0.0722][k] * v, 0);
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number), behind = (e) => {
+    for (; e; e = e.parentElement) {
+      const [r, g, b, a = 1] = rgb(getComputedStyle(e).backgroundColor);
+      if (a > 0.99) return [r, g, b];
+    }
+    return [255, 255, 255];
+  };
+  return [...document.querySelectorAll("body *")].filter((e) => !e.closest(":disabled") && e.checkVisibility()
+    && [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim())).map((e) => {
+    const [low, high] = [light(rgb(getComputedStyle(e).color).slice(0, 3)), light(behind(e))].sort((a, b) => a - b);
+    return [e.textContent.trim().slice(0, 40), (high + 0.05) / (low + 0.05)];
+  }).filter(([, ratio]) => ratio < 4.5);
+})()"""
+
+
+@pytest.mark.parametrize("on", [False, True], ids=["light", "dark"])
+def test_every_page_can_be_read_in_four_sizes(page, on):
+    page.dark(on=on)
+    try:
+        for width, height in SIZES:
+            page.resize(width, height)
+            for tab in ("files", "live", "commission", "history"):
+                page.evaluate(f"show('{tab}')")
+                assert page.evaluate(FAINT) == []
+                assert page.wide() == 0
+    finally:
+        page.dark(on=False)
+        page.resize(1366, 768)
+
+
+def test_a_report_that_fails_is_told_beside_the_result(page):
+    content = {"verdict": "usable", "reasons": [], "title": "rec", "subtitle": "", "warnings": [], "sections": [],
+               "spread": ""}  # fmt: skip
+    frames = [{"kind": "result", "name": "rec", "content": content}, {"kind": "report", "why": "no room for a legend"}]
+    page.evaluate("show('files')")
+    page.evaluate(
+        "import('/static/files.js').then(({ results }) => { for (const m of "
+        f"{json.dumps(frames)}) results(m, $('detail')); }})"
+    )
+    page.with_text("#detail .report.caution", "no room for a legend")
+    assert page.text("#detail h2") == "Usable"
+
+
+def test_an_empty_folder_says_what_is_to_be_done(tmp_path):
+    with console(tmp_path) as served, chromium() as browser:
+        page = browser.open(served.link)
+        page.with_text("#list td", "Copy a record into it")
+        page.with_text("#runs td", "Nothing was started here yet")
+        page.evaluate("show('commission')")
+        assert page.text("#commission-form [name=rig]") == "no rig with [loop] yet"
+        assert page.evaluate("$('commission-form').elements.redesign.disabled")  # on a simulated bench
+        page.put("#commission-form [name=port]", "emulated")
+        assert not page.evaluate("$('commission-form').elements.redesign.disabled")
+        assert page.wrong == []

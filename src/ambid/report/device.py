@@ -142,7 +142,7 @@ def _table(q: QualityReport) -> Table:
         sensed = c.role not in _ORDERED
         rows.append(
             (
-                c.name,
+                f"{c.name} [1]" if c.unit == "1" else c.name,
                 f"{c.mean:.4g}{unit}",
                 f"{c.sd:.3g}{unit}",
                 f"{c.noise_sd:.2g}{unit}" if sensed else "-",

@@ -1,6 +1,6 @@
 // Commissioning.
 import { $, el, put, state, WORDS } from "./core.js";
-import { drawn, link } from "./files.js";
+import { drawn, link, progressLine } from "./files.js";
 import { refresh } from "./lists.js";
 import { orderWords, Watched } from "./run.js";
 import { again, confirmed, question } from "./stop.js";
@@ -21,8 +21,12 @@ export class Steps extends Watched {
   tell(m) {
     const how = {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
-      progress: () => this.at && !this.done.has(this.at) && this.note(this.at,
-        `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
+      progress: () => {
+        if (!this.at || this.done.has(this.at) || this.over) return;
+        this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`);
+        this.line ??= progressLine(`commission ${this.out}`);
+        this.line.tell({ ...m, stage: `${this.at}, step ${this.done.size + 1} of ${Object.keys(this.items).length}` });
+      },
       step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)),
         order: () => this.append(el("p", { className: m.done ? "hint" : "refused" }, orderWords(m).join(": "))),
         ask: () => this.question(m), stopping: () => this.at && !this.done.has(this.at) && this.note(this.at, "is being stopped"),
@@ -37,6 +41,7 @@ export class Steps extends Watched {
         }).catch(() => {});
       },
       end: () => {
+        this.line?.end();
         this.question({});
         for (const name of Object.keys(this.items)) {
           if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached");

@@ -26,12 +26,12 @@ export function choose(file) {
 function chosenResult(file, detail) {
   const beside = [file.name.replace(/\.json$/, ".html"), file.name.replace(/[^/]*$/, "report.html")], host = el("div");
   const report = state.files.find((f) => beside.includes(f.name));
-  detail.append(el("p", { className: file.verdict }, WORDS[file.verdict] ?? "no verdict", file.why ? `: ${file.why}` : ""),
-    report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."), host);
+  host.append(el("p", { className: file.verdict }, WORDS[file.verdict] ?? "no verdict", file.why ? `: ${file.why}` : ""));
+  detail.append(report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."), host);
   if (file.schema.startsWith("ambid.estimate")) loopForm(file, detail);
   if (file.schema.startsWith("ambid.commission")) return;  // which its report alone shows
   job({ job: "result", estimate: file.number }, (m) => {
-    if (m.kind === "result") put(host, ...verdict(m.content, { head: "What it says" }), ...sections(m.content));
+    if (m.kind === "result") put(host, ...verdict(m.content), ...sections(m.content));
   }).catch(wrong(host));
 }
 // The loop of an estimate: margins as it is, and a better one.
@@ -63,29 +63,34 @@ export function link(report) {
   return el("span", {}, anchor);
 }
 
-// A job that computes: progress in the head of the page, in view wherever that is scrolled to, cancel, and what it found.
-export async function job(spec, tell) {
-  const of = state.files.find((f) => f.number === (spec.record ?? spec.estimate ?? spec.ledger))?.name ?? spec.out ?? "";
-  const bar = el("progress", { max: 1 }), words = el("span", { role: "status" }), cancel = el("button", {}, "Cancel");
+// Progress of a whole run in the head of the page, in view wherever that is scrolled to.
+export function progressLine(name, cancel = null) {
+  const bar = el("progress", { max: 1 }), words = el("span", { role: "status" });
   const line = el("div", { className: "bar" }, bar, words, cancel);
   let now = { stage: "starting", seconds: 0, left: null }, at = performance.now();
   const draw = () => {
     const since = (performance.now() - at) / 1000, past = now.seconds + since, left = now.left === null ? null : now.left - since;
     if (left > 0) bar.value = past / (past + left); else bar.removeAttribute("value");
     const rest = left === null ? "" : left > 0 ? `, about ${seconds(left)} left` : ", longer than the last time";
-    words.textContent = `${spec.job} ${of}: ${now.stage}, ${seconds(past)}${rest}`;
+    words.textContent = `${name}: ${now.stage}, ${seconds(past)}${rest}`;
   };
   $("work").append(line); draw();
   const beat = setInterval(draw, 250);
+  return { tell(m) { now = m; at = performance.now(); draw(); }, end() { clearInterval(beat); line.remove(); } };
+}
+// A job that computes: progress, cancel, and what it found.
+export async function job(spec, tell) {
+  const of = state.files.find((f) => f.number === (spec.record ?? spec.estimate ?? spec.ledger))?.name ?? spec.out ?? "";
+  const cancel = el("button", {}, "Cancel"), line = progressLine(`${spec.job} ${of}`, cancel);
   try {
     const place = ["preview", "history", "result"].includes(spec.job) ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
     cancel.onclick = () => ask(`${place}/${id}/say`, { word: "stop" }).catch(trouble);
     return await new Promise((done, fail) => listen(id, (m) => {
-      if (m.kind === "progress") { now = m; at = performance.now(); draw(); }
+      if (m.kind === "progress") line.tell(m);
       else if (m.kind === "end") m.how === "done" ? done() : fail(new Error(m.why));
       else tell(m);
     }));
-  } finally { clearInterval(beat); line.remove(); refresh().catch(() => {}); }
+  } finally { line.end(); refresh().catch(() => {}); }
 }
 export function wrong(host) { return (error) => host.append(el("p", { className: "refused", role: "alert" }, error.message)); }
 

@@ -1,5 +1,5 @@
 // Files and runs of the folder as lists, and what may be chosen from them.
-import { $, ask, el, feed, learn, MOVING, state, when } from "./core.js";
+import { $, ask, el, feed, learn, MOVING, put, state, when } from "./core.js";
 import { choose } from "./files.js";
 import { attached } from "./run.js";
 import { watch } from "./start.js";
@@ -19,8 +19,10 @@ export async function refresh() {
   fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`,
     r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
   for (const form of ["live-form", "commission-form"]) {
-    choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig" && (f.loop || form === "live-form")));
+    const rigs = state.files.filter((f) => f.kind === "rig" && (f.loop || form === "live-form"));
+    choices($(form).elements.rig, rigs, !rigs.length && (form === "live-form" ? "no rig yet" : "no rig with [loop] yet"));
     for (const field of $(form).elements) field.disabled = state.read_only;
+    if (form === "commission-form") offerRedesign();
   }
   const bare = state.read_only ? "This console is read only: runs that others start are shown here."
     : state.files.some((f) => f.kind === "rig") ? ""
@@ -38,11 +40,18 @@ export async function refresh() {
   const moving = state.runs.find((r) => r.alive && MOVING.includes(r.spec.job));
   if (moving && (feed?.id !== moving.id || feed.brokeOff) && !attached.has(moving.id)) { attached.add(moving.id); watch(moving); }
 }
+function offerRedesign() {  // which the firmware alone can try
+  const { port, redesign } = $("commission-form").elements, simulated = port.value === "simulated";
+  redesign.disabled = state.read_only || simulated;
+  redesign.parentNode.title = simulated ? "Only the firmware tries another loop: take the port emulated, or a bench" : "";
+  if (simulated) redesign.checked = false;
+}
+$("commission-form").elements.port.addEventListener("input", offerRedesign);
 function fill(body, things, cells, chosen, key) {
   const text = JSON.stringify(things.map(key));
   if (body.dataset.key === text) return;
   body.dataset.key = text;
-  const held = body.contains(document.activeElement);
+  const held = body.contains(document.activeElement), { empty } = body.parentNode.dataset;
   body.replaceChildren(...things.map((thing) => {
     const pick = () => chosen(thing);
     const row = el("tr", { tabIndex: -1, "data-of": key(thing)[0], onclick: () => { rove(row); pick(); },
@@ -51,6 +60,7 @@ function fill(body, things, cells, chosen, key) {
     if (thing.why) (thing.kind ? row.firstChild : row.lastChild).append(el("div", { className: "hint why", title: thing.why }, thing.why));
     return row;
   }));
+  if (!things.length) return put(body, el("tr", {}, el("td", { colSpan: 4, className: "hint" }, empty)));
   const at = [...body.rows].find((r) => r.dataset.of === body.dataset.at) ?? body.rows[0];
   if (at) { at.tabIndex = 0; at.ariaCurrent = at.dataset.of === body.dataset.at ? "true" : null; if (held) at.focus(); }
 }

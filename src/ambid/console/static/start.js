@@ -38,7 +38,7 @@ $("commission-form").elements.out.value = `commission-${stamp()}`;
 export function watch(run) {
   attached.add(run.id);
   if (!MOVING.includes(run.spec.job)) return past(run);
-  feed?.socket?.close(); attend(null);
+  feed?.socket?.close(); feed?.line?.end(); attend(null);
   attend(run.spec.job === "live" ? new Live(run) : new Steps(run));
   show(run.spec.job); lookOld();
 }
