@@ -12,6 +12,7 @@ import json
 import os
 import struct
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from io import FileIO
@@ -24,6 +25,7 @@ _HEAD = struct.Struct("<Ic")
 _PART = 2 << 20  # bytes after which a new part begins: 2.7 minutes of eight signals at 200 envelopes a second
 _KEPT = 24  # parts: about an hour
 _SPARE = 1 << 16
+_EVENTS, _MOST_EVENTS = ("alarm", "device", "note", "order"), 200  # kinds that later parts begin with too, the latest
 _LONGEST = 1 << 26  # bytes of a frame; what claims more is damaged
 
 
@@ -37,6 +39,7 @@ class FeedWriter:
         self._folder, self._size, self._kept = folder, part_bytes, kept
         self._lock = threading.Lock()
         self._sticky: dict[str, bytes] = {}
+        self._events: deque[Mapping[str, Any]] = deque(maxlen=_MOST_EVENTS)
         self._states: dict[str, Callable[[], Mapping[str, Any]]] = {}
         self._number = next_part(folder)
         self._file: FileIO | None = None
@@ -57,6 +60,8 @@ class FeedWriter:
                 with suppress(OSError):
                     self._spare.unlink(missing_ok=True)
             self._append(frame)
+            if kind in _EVENTS:
+                self._events.append({"kind": kind, **content})
 
     def keep(self, kind: str, content: Callable[[], Mapping[str, Any]]) -> None:
         """Begin each later part with a JSON frame of what is known by then."""
@@ -88,6 +93,8 @@ class FeedWriter:
                 frame = _framed(b"J", json.dumps(note).encode()) + frame
             if not at:
                 known = [_json_frame(kind, content()) for kind, content in self._states.items()]  # before any line
+                if self._events:
+                    known.append(_json_frame("before", {"events": list(self._events)}))
                 known += [f for f in self._sticky.values() if not frame.endswith(f)]
                 frame = b"".join((*known, frame))
             if file.write(frame) < len(frame):

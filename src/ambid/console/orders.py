@@ -6,12 +6,13 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from ambid.console.folder import open_plain
 from ambid.console.slot import Slot, append
 
 FRESH_S = 2.0
@@ -20,6 +21,7 @@ ANSWER_S = 0.6
 """How long an order waits to be carried out, s; a run that wakes later refuses it."""
 _ANSWERS = 8  # that are kept
 _LONGEST = 300  # characters of a text
+_LOG = 1 << 20  # bytes of the log that are looked through
 LATE = (
     "it came from a page that showed an older state, or waited too long: it is not carried out. "
     "Look at what is shown now, and order again"
@@ -56,6 +58,24 @@ class Order:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1 << 53
+
+
+def acknowledge(place: Path, keys: Sequence[str], by: str) -> None:
+    """Log that somebody has taken note of events of a run, which may be over."""
+    said = {"word": "acknowledge", "keys": [k[:_LONGEST] for k in keys], "by": by, "at": time.time(), "done": True}
+    append(place / "orders.jsonl", json.dumps(said))
+
+
+def acknowledged(place: Path) -> dict[str, tuple[str, float]]:
+    """Return which events of a run were acknowledged, by whom and when first."""
+    found = dict[str, tuple[str, float]]()
+    with suppress(OSError), open_plain(place / "orders.jsonl") as file:
+        for line in file.read(_LOG).splitlines():
+            with suppress(ValueError, KeyError, TypeError):
+                said = json.loads(line) if b'"acknowledge"' in line else {}
+                for key in said.get("keys", ()):
+                    found.setdefault(str(key), (str(said["by"]), float(said["at"])))
+    return found
 
 
 class Desk:

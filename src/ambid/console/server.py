@@ -31,15 +31,16 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ambid.console.authority import busy
+from ambid.console.envelope import WINDOWS
 from ambid.console.feed import FeedReader, json_frames
 from ambid.console.folder import Folder
 from ambid.console.guard import Guard
-from ambid.console.orders import ANSWER_S
+from ambid.console.orders import ANSWER_S, acknowledge, acknowledged
 from ambid.console.runs import MOVING, Run, Runs
 from ambid.errors import AmbidError
 from ambid.settings.caller import setting
 
-_LOOKS = ("preview", "history", "result")  # jobs that change nothing
+_LOOKS = ("preview", "look", "history", "result")  # jobs that change nothing
 
 _POLL_S = 0.02  # between two looks at a feed
 _ANSWER_POLL_S = 0.005  # between two looks for an answer
@@ -51,6 +52,7 @@ _VIEWERS = 16  # feeds that are watched at once
 _BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
 _PATIENCE_S = 20.0  # with a viewer that takes nothing
 _RUNS = 40  # that are listed, the newest, beside those that go on
+_KEYS = 200  # events that are acknowledged at once
 _START_S = 5.0  # how long one waits to be carried out
 _CONNECTIONS = 48  # before those that ask nothing give way
 _HEAD_S = 15.0  # in which a connection has to say what it asks
@@ -64,6 +66,11 @@ _WORDS = {"live": ("track", "hold", "accept", "revert"), "commission": ("go", "n
 # of each job: files that it reads, by their kinds; other fields with their types; the ending of what it makes
 _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     "preview": ({"record": "record"}, {"rate_hz": float, "gaps": str}, ""),
+    "look": (
+        {"record": "record", "rig": "rig"},
+        {"from_s": float, "to_s": float, "from_hz": float, "to_hz": float, "weights": str, "channel": str,
+         "across": str, "up": str}, "",
+    ),
     "history": ({"ledger": "ledger"}, {"bearing": str}, ""),
     "result": ({"estimate": "result"}, {}, ""),
     "rig": ({}, {"text": str}, ".toml"),
@@ -84,9 +91,10 @@ _CHOICES = {
     "pace": ("real-time", "fastest"),
     "excitation": ("multisine", "schroeder", "prbs", "steps"),
     "method": ("pid", "lqg"),
-    "gaps": ("error", "interpolate", "cut"),
+    "gaps": ("error", "interpolate", "cut"), "weights": tuple(WINDOWS),
 }
-_NEEDED = {"preview": ("record",), "history": ("ledger",), "result": ("estimate",), "identify": ("record", "rig"),
+_NEEDED = {"preview": ("record",), "look": ("record",), "history": ("ledger",), "result": ("estimate",),
+           "identify": ("record", "rig"),
            "margins": ("rig",), "design": ("rig", "estimate"), "live": ("rig", "port"),
            "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip
 
@@ -159,17 +167,18 @@ class Console:
 
     def _about(self, run: Run, page: str) -> dict[str, Any]:
         """Return what is shown of a run; one that is over is looked at once."""
+        moves = (self._over[run.id] if run.id in self._over else _about(run))["spec"]["job"] in MOVING
+        noted = {"acknowledged": acknowledged(run.place)} if moves else {}
         if run.id in self._over:
-            return self._over[run.id]
+            return {**self._over[run.id], **noted}
         if run.alive:
-            moves = run.spec.get("job") in MOVING
-            return {**_about(run), "alive": True, "end": "", **(_holder(run, page) if moves else {})}
+            return {**_about(run), "alive": True, "end": "", **(_holder(run, page) if moves else {}), **noted}
         end = _end(run)
         how, why = (str(end.get(k, ""))[:400] for k in ("how", "why")) if end else ("broke off", "")
         found = {**_about(run), "alive": False, "end": how[:20], "why": why}
         if end or time.time() - found["began"] > _BEGINS_S:
             self._over[run.id] = found
-        return found
+        return {**found, **noted}
 
     async def _rig_text(self, request: Request) -> Response:
         number = request.path_params["number"]
@@ -203,6 +212,8 @@ class Console:
     async def _say(self, request: Request) -> Response:
         """Order something, and answer what became of it."""
         asked, started = await _json(request), time.monotonic()
+        if asked.get("word") == "acknowledge":
+            return await _answer(lambda: self._acknowledge(request, asked.get("keys")))
 
         def say() -> tuple[Run, str]:
             runs = self.runs if request.url.path.startswith("/api/runs/") else self._looks
@@ -225,6 +236,14 @@ class Console:
         if answer is not None and not answer.get("done"):
             return _reply({"error": str(answer.get("why", ""))}, 409)
         return _reply({"delivered": answer is not None})
+
+    def _acknowledge(self, request: Request, keys: object) -> Mapping[str, Any]:
+        """Log that a page has taken note of events: everybody may, and also once the run is over."""
+        run = self.runs.one(request.path_params["name"])
+        if not isinstance(keys, list) or not all(isinstance(k, str) for k in keys) or not 0 < len(keys) <= _KEYS:
+            raise AmbidError(f"acknowledge needs 1 to {_KEYS} events. Reload the page")
+        acknowledge(run.place, keys, _name_of(request))
+        return {"delivered": True}
 
     async def _stop(self, request: Request) -> Response:
         """Stop whatever moves, and answer whether it was told: nothing is waited for before the order is out, but a run

@@ -124,7 +124,7 @@ class Worker:
 
     def note(self, line: str) -> None:
         """Tell a remark."""
-        self.feed.tell("note", {"text": line})
+        self.feed.tell("note", {"text": line, "wall": time.time()})
 
     def stopped(self) -> bool:
         """Whether the operator wants the end."""
@@ -277,6 +277,7 @@ class Worker:
 
 def _preview(worker: Worker) -> None:
     """Tell what a record holds, and draft its rig."""
+    from ambid.console.look import look
     from ambid.job.presentation import content
     from ambid.record import read_record
     from ambid.rig import draft_rig
@@ -294,6 +295,7 @@ def _preview(worker: Worker) -> None:
          "high": rounded(np.maximum.reduceat(c.values, starts))}
         for c in record.channels
     ]  # fmt: skip
+    worker.feed.tell("look", {**look(record), "limits": {}}, sticky="look")
     worker.tick("diagnostics")
     try:
         draft = draft_rig(record, reading=how)
@@ -316,6 +318,22 @@ def _result(worker: Worker) -> None:
     path = worker.path("estimate")
     assert path is not None
     worker.feed.tell("result", {"name": path.stem, "content": content(load(path))}, sticky="result")
+
+
+def _look(worker: Worker) -> None:
+    """Tell what plots show of a stretch of a record, and the limits of a rig."""
+    from ambid.console.look import limits, look
+    from ambid.record import read_record
+    from ambid.rig import load_rig
+
+    path, rig = worker.path("record"), worker.path("rig")
+    assert path is not None
+    asked = {
+        k: worker.spec[k] for k in ("from_s", "to_s", "from_hz", "to_hz", "weights", "channel") if k in worker.spec
+    }
+    pair = [worker.spec[k] for k in ("across", "up") if k in worker.spec]
+    lines = {} if rig is None else limits(load_rig(rig), columns=True)
+    worker.feed.tell("look", {**look(read_record(path), orbit=pair, **asked), "limits": lines})
 
 
 def _rig(worker: Worker) -> None:
@@ -375,6 +393,7 @@ def _live(worker: Worker) -> None:
     """Record and track what a device samples."""
     from ambid.acquisition.session import recording
     from ambid.acquisition.settings import BenchView
+    from ambid.console.look import limits
     from ambid.job.acquiring import Request, ready
     from ambid.job.results import read_linear_estimate
     from ambid.job.track_live import track_live
@@ -401,7 +420,7 @@ def _live(worker: Worker) -> None:
         told = _Lines(worker)
         opening_record = recording(device, rig, out, course, on_trouble=lambda e: worker.note(str(e)))
         with _storing(opening_record) as tap:
-            picture = EnvelopeTap(worker.feed, view, tap)
+            picture = EnvelopeTap(worker.feed, view, tap, limits(rig))
 
             def event(what: Any) -> None:
                 tap.tell(what)
@@ -483,6 +502,7 @@ class _Lines:
         self._state: LiveState | None = None
 
     def header(self, header: Any) -> None:
+        from ambid.console.look import meanings
         from ambid.tracking.lines_file import LiveState
 
         self._state = state = LiveState(header)
@@ -490,7 +510,7 @@ class _Lines:
         self._worker.feed.tell(
             "header",
             {"model": header.model, "method": header.method, "limit": header.limit, "units": dict(header.units),
-             "start": start, "warnings": list(header.warnings)},
+             "start": start, "warnings": list(header.warnings), "meanings": meanings(header.model)},
             sticky="header",
         )  # fmt: skip
         self._worker.feed.keep("told", lambda: {"events": [_told(e) for e in state.events]})
@@ -630,17 +650,20 @@ def drawn(found: History) -> Mapping[str, Any]:
     return {
         "bearing": found.bearing, "plant": found.plant, "content": content(found), "left_out": first,
         "estimates": [{k: getattr(e, k) for k in asked} for e in found.estimates[first:]],
-        "series": {name: _series(found, s, first) for name, s in found.measured.items()},
+        "series": {name: _series(found, name, s, first) for name, s in found.measured.items()},
         "events": [{k: getattr(e, k) for k in ("at", "kind", "text", "parameter")} for e in found.events],
     }  # fmt: skip
 
 
-def _series(found: History, s: Series, first: int) -> Mapping[str, Any]:
+def _series(found: History, name: str, s: Series, first: int) -> Mapping[str, Any]:
     """Return one series; `verdict`: of each estimate, or that its record did not show this number."""
+    from ambid.console.look import meanings
+
     of = s.estimate >= first
     said = zip(s.estimate[of], s.identifiable[of], strict=True)
     return {
-        "unit": s.unit, "t": s.taken_at[of].tolist(), "value": rounded(s.value[of], 9),
+        "unit": s.unit, "meaning": meanings(found.plant).get(name, ""),
+        "t": s.taken_at[of].tolist(), "value": rounded(s.value[of], 9),
         "sd": rounded(s.sd[of]), "half": rounded(NORMAL_95 * s.sd[of]),
         "verdict": [found.estimates[k].verdict if seen else "hidden" for k, seen in said],
         "known": int(np.count_nonzero(np.isfinite(s.value))),
@@ -648,7 +671,8 @@ def _series(found: History, s: Series, first: int) -> Mapping[str, Any]:
 
 
 JOBS: Mapping[str, Callable[[Worker], None]] = {
-    "preview": _preview, "result": _result, "rig": _rig, "identify": _identify, "margins": _margins, "design": _design,
+    "preview": _preview, "look": _look, "result": _result, "rig": _rig, "identify": _identify, "margins": _margins,
+    "design": _design,
     "export": _export, "history": _history, "live": _live, "commission": _commission,
 }  # fmt: skip
 
