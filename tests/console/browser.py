@@ -19,7 +19,19 @@ NEEDED = [
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: apt-get install chromium"),
     pytest.mark.skipif(os.environ.get("CI") == "true", reason="browsers are for machines of people"),
 ]
-_KEYS = {"Enter": 13, "Escape": 27, "End": 35, "ArrowLeft": 37, "Tab": 9, ".": 190, " ": 32}
+_KEYS = {
+    "Enter": 13,
+    "Escape": 27,
+    "End": 35,
+    "Home": 36,
+    "ArrowLeft": 37,
+    "ArrowRight": 39,
+    "Delete": 46,
+    "+": 187,
+    "Tab": 9,
+    ".": 190,
+    " ": 32,
+}
 # where an element is, once it is in view and nothing lies over it
 _PLACE = """((of) => {
   const one = typeof of === "string" ? document.querySelector(of) : of;

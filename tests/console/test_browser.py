@@ -206,7 +206,7 @@ def test_a_bearing_of_a_ledger_is_drawn_over_time_in_chosen_colours(page, folder
     page.put("#history-form [name=bearing]", "B")
     page.with_text("#history-view h2", "B: Usable")
     assert page.count("#history-charts .chart") == 2
-    latest = page.with_text("#history-charts .chart h3", "k_i") + ".querySelector('span').textContent"
+    latest = page.with_text("#history-charts .chart h3", "k_i") + ".querySelector('.value').textContent"
     assert page.evaluate(latest) == "79.70 ± 0.50 N/A, 2026-01-04"
     page.hover("#history-charts .u-over", 300, 40)
     page.put("#theme", "◐ dark")

@@ -2,7 +2,7 @@
 import { $, ask, el, proven, put, seconds, show, state, stem, WORDS } from "./core.js";
 import { histories } from "./history.js";
 import { refresh } from "./lists.js";
-import { strip } from "./plot.js";
+import { recordView } from "./records.js";
 import { rigForm, rigView } from "./rigform.js";
 import { listen } from "./run.js";
 import { trouble } from "./stop.js";
@@ -83,7 +83,8 @@ export async function job(spec, tell) {
   const of = state.files.find((f) => f.number === (spec.record ?? spec.estimate ?? spec.ledger))?.name ?? spec.out ?? "";
   const cancel = el("button", {}, "Cancel"), line = progressLine(`${spec.job} ${of}`, cancel);
   try {
-    const place = ["preview", "history", "result"].includes(spec.job) ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
+    const place = ["preview", "look", "history", "result"].includes(spec.job) ? "/api/previews" : "/api/runs",
+      { id } = await ask(place, spec);
     cancel.onclick = () => ask(`${place}/${id}/say`, { word: "stop" }).catch(trouble);
     return await new Promise((done, fail) => listen(id, (m) => {
       if (m.kind === "progress") line.tell(m);
@@ -95,12 +96,12 @@ export async function job(spec, tell) {
 export function wrong(host) { return (error) => host.append(el("p", { className: "refused", role: "alert" }, error.message)); }
 
 function preview(file, detail, how = {}) {
-  const host = el("div"), next = el("div");
-  detail.append(host, next);
+  const host = el("div"), next = el("div"), plots = el("div"), view = recordView(file, plots);
+  detail.append(plots, host, next);
   job({ job: "preview", record: file.number, ...how }, (m) => {
     if (m.kind === "note") host.append(el("p", { className: "caution" }, m.text));
+    if (m.kind === "look") view.show(m);
     if (m.kind !== "preview") return;
-    for (const c of m.channels) host.append(strip(`${c.name} [${c.unit}]`, m.t, c.low, c.high, 92).box);
     host.append(...sections(m.content));
     identifyForm(file, { ...m, file: file.name }, next);
   }).catch((error) => { wrong(host)(error); readingForm(file, detail, next); });

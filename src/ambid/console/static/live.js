@@ -1,16 +1,20 @@
 // The live view.
+import { Alarms } from "./alarms.js";
 import { $, el, feed, LATE_S, put, seconds, shown, SLOTS, state, stem } from "./core.js";
 import { job, wrong } from "./files.js";
 import { refresh } from "./lists.js";
-import { BAND, chart, css, ink, line, narrow, pick, upright } from "./plot.js";
+import { chart, css, fill, Group, ink, line, narrow, orbit, Spectra, strip, waterfall } from "./plot.js";
 import { orderWords, Watched } from "./run.js";
 import { banner, pose, question, stop } from "./stop.js";
 import { sections, verdict } from "./tables.js";
 
-const COLOURS = ["--accent", "--doubt", "--good", "--bad"];
-function decades(u, axis, low, high) {
-  const a = Math.ceil(Math.log10(low) - 1e-9), z = Math.floor(Math.log10(high) + 1e-9), step = Math.max(1, Math.ceil((z - a) / 5));
-  return Array.from({ length: Math.max(0, Math.floor((z - a) / step) + 1) }, (_, k) => 10 ** (a + k * step));
+function pick(values, a, z, step, of) {
+  const found = [];
+  for (let k = a; k < z; k += step) {
+    const part = values.slice(k, Math.min(z, k + step)).filter((x) => x !== null);
+    found.push(part.length ? of(part) : null);
+  }
+  return found;
 }
 export class Live extends Watched {
   constructor(run) {
@@ -21,6 +25,9 @@ export class Live extends Watched {
     this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
     $("live-view").hidden = false; $("live-hint").hidden = true;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
+    this.alarms = new Alarms(run, $("events"));
+    this.group = new Group({ still: () => this.frozen, full: () => [this.t[0] ?? 0, this.t.at(-1) ?? 1],
+      zoomed: (range) => { this.zoom = range; this.redraw(); } });
     $("summary").hidden = true;
     for (const host of ["lag", "count", "lost", "tally"]) put($(host));  // nothing of the run before stands as this one's
     freeze(this, false);
@@ -32,9 +39,10 @@ export class Live extends Watched {
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; },
       header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
-      event: () => { this.heard = true; this.event(m.t, m.what, m.why); }, told: () => this.before(m),
-        device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
-        order: () => this.event(null, ...orderWords(m)),
+      event: () => this.event(m.t, m.what, m.why), alarm: () => this.event(m.t, m.what, m.why),
+      told: () => m.events.forEach((e) => this.event(e.t, e.what, e.why)), before: () => m.events.forEach((e) => this.tell(e)),
+      device: () => this.event(m.sample === null ? null : m.sample / (this.signals?.rate_hz ?? NaN), m.what, m.text),
+      note: () => this.event(null, "note", m.text, m.wall), order: () => this.event(null, ...orderWords(m), m.at),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
       summary: () => { put($("summary"), ...verdict(m.content), ...sections(m.content)); $("summary").hidden = false; },
       recorded: () => { this.sampled = Infinity; this.record = m.name;
@@ -50,23 +58,25 @@ export class Live extends Watched {
     this.low = m.names.map(() => []); this.high = m.names.map(() => []);
     const height = innerWidth > 900 ? Math.min(240, Math.max(118, (innerHeight - 140) / m.names.length - 34)) : 118;
     this.strips = m.names.map((name, k) => {
-      const made = chart(name, height, BAND(), m.units[k], { bands: [{ series: [2, 1], fill: ink("--accent", "66") }],
-        hooks: { setSelect: [(u) => this.mark(u)], drawClear: [(u) => this.shade(u)] } });
-      made.plot.over.addEventListener("dblclick", () => { this.zoom = null; this.redraw(); });
+      const made = strip(name, height, [{ name, unit: m.units[k] }], { group: this.group, select: (a, b) => this.mark(a, b),
+        limits: () => m.limits?.[name] ?? [], marks: () => this.alarms.marks, hooks: { drawClear: [(u) => this.shade(u)] },
+        kind: `smallest and largest of ${seconds(m.group / m.rate_hz)} each` });
       $("strips").append(made.box);
       return made;
     });
-    const made = chart("spectrum", 140, m.names.map((_, k) => line(ink(COLOURS[k % 4]))), "",
-      { scale: { distr: 3 }, scales: { y: { distr: 3 } }, hooks: { draw: [turns] },
-      x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""),
-      yaxis: { splits: decades, values: (u, s) => s.map((v) => v === 1 ? "1" : v?.toExponential(0) ?? "") } });
-    put(made.box.querySelector("h3"), "spectrum, peak", el("span", { className: "names" },
-      ...m.names.map((n, k) => { const name = el("b", {}, ` ${n} [${m.units[k]}]`); name.style.color = `var(${COLOURS[k % 4]})`;
-      return name; })));
-    $("spectrum").append(made.box);
-    this.lines4 = made;
-    const two = m.names.map((n, k) => [n, k]).filter(([n]) => n.endsWith("position"));
-    if (two.length > 1) this.orbitOf = two.slice(0, 2).map(([, k]) => k);
+    const signals = m.names.map((name, k) => ({ name, unit: m.units[k] })), choice = el("select", { ariaLabel: "signal of the waterfall" },
+      ...m.names.map((n, k) => el("option", { value: k, selected: n.endsWith("position") }, n)));
+    this.spectra = new Spectra($("spectrum"), signals, { group: new Group({ unit: "Hz", log: true }), turns, height: 130 });
+    this.fall = waterfall("Waterfall", 190, { group: new Group(), turns, log: true }); this.seconds = [];
+    this.open = el("details", { ontoggle: () => this.drawFall() }, el("summary", {}, "Waterfall of the last two minutes"), choice,
+      this.fall.box);
+    choice.onchange = () => this.drawFall(); this.fallOf = choice;
+    $("spectrum").append(this.open);
+    const two = m.names.map((n, k) => [n, k]).filter(([n]) => n.endsWith("position")).slice(0, 2);
+    if (two.length > 1) {
+      this.ring = orbit(`Orbit, middles of ${seconds(m.group / m.rate_hz)}: what is faster is averaged`, 260);
+      this.ringOf = two; $("orbit").append(this.ring.box);
+    }
   }
   envelope(data, at) {
     if (!this.signals) return;
@@ -94,11 +104,16 @@ export class Live extends Watched {
     this.header = m;
     for (const [name, v] of Object.entries(m.start)) {
       const made = chart(name, 92, [line("transparent"), line("transparent"), line(ink("--accent"), { width: 1.6 }),
-        line(ink("--dim"), { dash: [4, 4] })], m.units[name], { bands: [{ series: [2, 1], fill: ink("--accent", "33") }] });
+        line(ink("--dim"), { dash: [4, 4] })], m.units[name], { bands: [fill(1, "--accent", "33")], main: 3, group: this.group,
+        meaning: m.meanings?.[name], marks: () => this.alarms.marks, kind: "value; drawn with its 95 % band, dashed the start",
+        read: (k) => { const [, low, high, v] = made.plot.data; return shown(v[k], m.units[name], (high[k] - low[k]) / 3.92); } });
       $("parameters").append(made.box);
       this.parameters[name] = { ...made, start: v.value, unit: m.units[name], band: [[], [], []] };
     }
-    const error = chart("model error, limit dashed", 92, [line(ink("--accent"), { width: 1.6 }), line(ink("--bad"), { dash: [4, 4] })], "");
+    $("parameters").prepend(el("p", { className: "hint wide" }, SD));
+    const error = chart("model error, limit dashed", 92, [line(ink("--accent"), { width: 1.6 }), line(ink("--bad"), { dash: [4, 4] })], "",
+      { group: this.group, marks: () => this.alarms.marks, meaning: "How large the errors of the model's predictions are beside what "
+        + "it expects: 1 where the model explains the record; above the limit it does not" });
     $("error").append(error.box);
     this.error = error;
     for (const w of m.warnings) this.event(null, "start", w);
@@ -133,24 +148,11 @@ export class Live extends Watched {
     if (await pose(() => this.choice(word), { yes, run: this })) this.order(word,
       word === "revert" ? { goal: this.lines.at(-1).choices.revert?.t } : {});
   }
-  event(t, what, why) {
-    $("events").prepend(el("li", { className: what === "change" || what === "fault" ? "refused" : "" },
-      `${t === null || t === undefined ? "" : `${t.toFixed(2)} s `}${what}: ${why}`));
-    while ($("events").children.length > 200) $("events").lastChild.remove();
-  }
-  before(m) {  // events that were told before this page came
-    if (this.heard || this.lines.length) return;
-    this.heard = true;
-    for (const e of m.events) this.event(e.t, e.what, e.why);
-  }
-  mark(u) {  // what is dragged over; in a picture that stands still it is shown closer too
-    if (!u.select.width) return;
-    const a = u.posToVal(u.select.left, "x"), b = u.posToVal(u.select.left + u.select.width, "x");
-    u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+  event(t, what, why, at) { this.alarms.add(t, what, why, at); }
+  mark(a, b) {  // what is dragged over; in a picture that stands still it is shown closer too
     if (!(b - a > 1e-3)) return this.unmark();
     this.marked = [a, b];
-    if (this.frozen) this.zoom = [a, b];
-    this.redraw();
+    this.frozen ? this.group.to(a, b) : this.redraw();
     $("export").disabled = false;
     $("export").textContent = `Export ${a.toFixed(2)} to ${b.toFixed(2)} s`;
   }
@@ -161,7 +163,7 @@ export class Live extends Watched {
     this.redraw();
   }
   shade(u) {  // the stretch that is marked, which moves with its samples
-    if (!this.marked) return;
+    if (!this.marked || this.zoom?.join() === this.marked.join()) return;
     const [a, b] = this.marked.map((x) => Math.min(Math.max(u.valToPos(x, "x", true), u.bbox.left), u.bbox.left + u.bbox.width));
     u.ctx.fillStyle = css("--doubt") + "44"; u.ctx.fillRect(a, u.bbox.top, b - a, u.bbox.height);
   }
@@ -171,7 +173,7 @@ export class Live extends Watched {
     if (!this.frozen && !stop && !$("live").hidden) {  // nothing is drawn while a stop is on its way
       if (this.dirty) this.drawStrips(...this.window());
       if (this.dirtyLines) this.drawLines(...this.window());
-      if (this.spectrum && this.lines4) this.drawSpectrum();
+      if (this.spectrum && this.spectra) this.drawSpectrum();
       this.dirty = this.dirtyLines = false;
     }
     requestAnimationFrame(this.draw);
@@ -193,9 +195,9 @@ export class Live extends Watched {
       const low = step === 1 ? this.low[k].slice(a, z) : pick(this.low[k], a, z, step, (x) => Math.min(...x)),
         high = step === 1 ? this.high[k].slice(a, z) : pick(this.high[k], a, z, step, (x) => Math.max(...x));
       s.plot.batch(() => { s.plot.setData([t, low, high], false); s.plot.setScale("x", { min: from, max: Math.max(end, from + 0.1) }); });
-      s.value.textContent = `${shown(this.low[k].at(-1), this.signals.units[k])} to ${shown(this.high[k].at(-1), this.signals.units[k])}`;
+      s.say(`${shown(this.low[k].at(-1), this.signals.units[k])} to ${shown(this.high[k].at(-1), this.signals.units[k])}`);
     });
-    if (this.orbitOf) this.drawOrbit(a);
+    if (this.ring && this.updates % 4 === 0) this.drawOrbit();
     if (this.frozen) return;
     $("count").textContent = `${end.toFixed(1)} s, ${this.samples} samples`;
     $("lost").textContent = this.lost ? `${this.lost} samples LOST` : "0 lost"; $("lost").className = this.lost ? "late" : "";
@@ -203,17 +205,28 @@ export class Live extends Watched {
     this.updates = (this.updates ?? 0) + 1;
   }
   drawSpectrum() {
-    const floor = (a) => a.map((v) => v > 0 ? v : null);
-    this.lines4.plot.setData([this.spectrum.hz, ...this.spectrum.amplitudes.map(floor)]); this.spectrum = null;
+    const words = `Hann window, resolution ${shown(this.signals.resolution, "Hz")}`;
+    this.spectra.show({ ...this.spectrum, words });
+    this.seconds.push({ t: this.t.at(-1) ?? 0, ...this.spectrum });
+    if (this.seconds.length > 120) this.seconds.shift();
+    this.spectrum = null;
+    this.drawFall();
   }
-  drawOrbit(a = this.t.length - 400) {
-    const [x, y] = this.orbitOf.map((k) => this.low[k].slice(Math.max(a, this.t.length - 400)).map(
-      (v, i) => (v + this.high[k][Math.max(a, this.t.length - 400) + i]) / 2));
-    const canvas = $("orbit").firstChild ?? $("orbit").appendChild(el("canvas", { width: 240, height: 240 })), g = canvas.getContext("2d");
-    const size = Math.max(...x.map(Math.abs), ...y.map(Math.abs), 1e-12);
-    g.clearRect(0, 0, 240, 240); g.strokeStyle = css("--accent"); g.beginPath();
-    x.forEach((v, k) => g.lineTo(120 + 110 * v / size, 120 - 110 * y[k] / size)); g.stroke();
-    g.fillStyle = css("--dim"); g.fillText(`orbit, ±${shown(size, "m")}`, 6, 12);
+  drawFall() {
+    if (!this.open.open || !this.seconds.length) return;
+    const k = Number(this.fallOf.value), { hz } = this.seconds[0], rows = [...hz.keys()].filter((j) => j % 2 === 0 || hz[j] < 100);
+    const most = (a, j, n) => rows[n + 1] - j > 1 ? Math.max(a[j], a[j + 1]) : a[j];
+    this.fall.group.range = null;
+    this.fall.show({ name: this.signals.names[k], unit: this.signals.units[k], hz: rows.map((j) => hz[j]), top: hz.at(-1),
+      x: this.seconds.map((s) => s.t), amplitudes: this.seconds.map((s) => rows.map((j, n) => most(s.amplitudes[k], j, n))), turning: null,
+      words: `Hann window, resolution ${shown(this.signals.resolution, "Hz")}, over time` });
+  }
+  drawOrbit() {
+    const from = Math.max(0, this.t.length - 400);
+    const [x, y] = this.ringOf.map(([, k]) => this.low[k].slice(from).map((v, i) => v === null ? null : (v + this.high[k][from + i]) / 2));
+    const whole = x.map((v, i) => i).filter((i) => x[i] !== null && y[i] !== null);
+    const unit = this.signals.units[this.ringOf[0][1]];
+    this.ring.show(whole.map((i) => x[i]), whole.map((i) => y[i]), { names: this.ringOf.map(([n]) => n), unit });
   }
   drawLines(from, end) {  // over the stretch that the strips show
     const lines = this.lines.filter((l, k) => (this.lines[k + 1] ?? l).t >= from && (this.lines[k - 1] ?? l).t <= end);
@@ -225,27 +238,20 @@ export class Live extends Watched {
       set(p.plot, [t, v.map((x, k) => x === null ? null : x - 1.96 * s[k]), v.map((x, k) => x === null ? null : x + 1.96 * s[k]), v,
         t.map(() => p.start)]);
       const [value, sd, stale] = last.values[name] ?? [];
-      p.value.textContent = shown(value, p.unit, sd) + (stale ? " (frozen)" : "");
+      p.say(shown(value, p.unit, sd) + (stale ? " (frozen)" : ""));
     }
     if (this.error) set(this.error.plot, [t, lines.map((l) => l.error), t.map(() => this.header.limit)]);
-    if (this.error) this.error.value.textContent = last.error === null ? "unknown" : last.error.toFixed(2);
+    if (this.error) this.error.say(last.error === null ? "unknown" : last.error.toFixed(2));
   }
 }
-// The speed of the rotor and its multiples in a spectrum.
-function turns(u) {
-  const hz = Number($("speed").value) / 60;
-  for (const k of hz > 0 ? [1, 2, 3] : []) {
-    const x = u.valToPos(k * hz, "x", true);
-    if (x >= u.bbox.left && x <= u.bbox.left + u.bbox.width) upright(u, x, css("--doubt"), `${k}×`);
-  }
-}
-
+const SD = "± is one standard deviation (sd), bands are 95 %, dashed: the start. A name's meaning shows under the pointer.";
+const turns = () => Number($("speed").value) > 0 ? [Number($("speed").value) / 60] : [];  // a second
 for (const button of document.querySelectorAll("[data-say]")) {
   const word = button.dataset.say;
   button.onclick = () => ["accept", "revert"].includes(word) ? feed.decide(word) : feed.order(word);
 }
 function freeze(live, frozen) {
-  live.frozen = frozen; live.zoom = null;
+  live.frozen = frozen; live.zoom = null; if (live.group) live.group.range = null;
   $("freeze").setAttribute("aria-pressed", frozen);
   $("freeze").textContent = frozen ? "Go on" : "Freeze";
   $("back").hidden = !frozen;
@@ -253,8 +259,8 @@ function freeze(live, frozen) {
 }
 $("freeze").onclick = () => freeze(feed, !feed.frozen);
 $("speed").value = sessionStorage.speed ?? "";
-$("speed").oninput = () => { sessionStorage.speed = $("speed").value; feed?.lines4?.plot.redraw(); };
-$("back").oninput = $("span").onchange = () => { if (feed?.t) { feed.zoom = null; feed.redraw(); } };
+$("speed").oninput = () => { sessionStorage.speed = $("speed").value; feed?.spectra?.draw(); feed?.drawFall?.(); };
+$("back").oninput = $("span").onchange = () => { if (feed?.t) { feed.zoom = feed.group.range = null; feed.redraw(); } };
 $("export").onclick = async () => {
   const file = state.files.find((f) => f.name === feed.record);
   if (!file) { banner("The record can be cut when the run is over", "note"); return; }

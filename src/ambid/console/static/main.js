@@ -10,7 +10,6 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 function colours() {
   document.documentElement.toggleAttribute("data-dark", $("theme").value ? $("theme").value === "dark" : dark.matches);
   recolour();
-  if (feed?.orbitOf) feed.drawOrbit();
 }
 
 $("theme").value = document.cookie.match(/(?:^|; )ambid_colours=(light|dark)/)?.[1] ?? "";
