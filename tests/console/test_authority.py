@@ -25,7 +25,7 @@ from ambid.console import runs
 from ambid.console.authority import Lease, Machine
 from ambid.console.envelope import EnvelopeTap
 from ambid.console.feed import FeedReader, FeedWriter, json_frames
-from ambid.console.orders import Desk, Order
+from ambid.console.orders import Desk, Order, acknowledge, acknowledged
 from ambid.console.runs import Heard, Run, Runs
 from ambid.console.server import _answered
 from ambid.console.slot import Slot
@@ -286,6 +286,45 @@ def test_a_sample_is_shown_once_the_journal_has_it_and_lost_ones_are_counted(tmp
     shown = envelopes(tmp_path)
     assert [(a, n) for a, n, _ in shown] == [(0, 20), (20, 40), (70, 20), (110, 20)]
     assert shown[-1][2] == 30
+
+
+def test_a_limit_that_is_passed_and_samples_that_are_lost_are_alarms_which_a_late_page_is_told(tmp_path):
+    view = SimpleNamespace(units={"position": "m"}, rate_hz=2000.0, block=lambda block: block)
+    journal = SimpleNamespace(stored=True, written=2**62)
+    lines = {"position": [{"at": 9e-4, "words": "trip"}, {"at": -1e-3, "words": "the rotor touches"}]}
+    feed = FeedWriter(tmp_path, part_bytes=400, kept=10_000)  # a few frames a part
+    tap = EnvelopeTap(feed, view, journal, lines)
+    for k in range(600):  # six seconds
+        values = np.zeros((20, 1))
+        values[7] = {10: 9.5e-4, 11: 9.6e-4, 300: 9.7e-4, 301: -2e-3}.get(k, 0.0)
+        first = 20 * k + 40 * (k > 400)  # forty are lost
+        tap.take(Frame(block=Block(first=first, time_s=first / 2000, values=values), arrived_s=0.06 * k))
+    reader, frames = FeedReader(tmp_path, parts=9999), []
+    while data := reader.read():
+        frames += json_frames(data)
+    alarms = told(frames, "alarm")
+    assert [(m["t"], m["what"]) for m in alarms] == [
+        (pytest.approx(0.1035), "limit"), (pytest.approx(3.0035), "limit"), (pytest.approx(3.0135), "limit"),
+        (pytest.approx(4.03, abs=0.03), "lost"),
+    ]  # fmt: skip
+    assert [m["why"] for m in alarms[1:]] == [
+        "position passed 0.0009 m: trip", "position passed -0.001 m: the rotor touches", "40 samples lost",
+    ]  # fmt: skip
+    late = json_frames(FeedReader(tmp_path, parts=1).read(1 << 26))
+    assert told(late, "before")[0]["events"] == alarms
+
+
+def test_who_acknowledged_an_event_first_is_kept(tmp_path):
+    acknowledge(tmp_path, ["a", "b"], "page one")
+    Desk(tmp_path).answer(Order.of({"word": "hold", "id": "1"}))
+    acknowledge(tmp_path, ["b"], "page two")
+    with (tmp_path / "orders.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"word": "acknowledge", "keys": 3}\nx"acknowledge"\n')
+    assert {key: by for key, (by, at) in acknowledged(tmp_path).items() if at > 1.7e9} == {
+        "a": "page one",
+        "b": "page one",
+    }
+    assert acknowledged(tmp_path / "none") == {}
 
 
 def test_no_sample_that_was_shown_is_missing_after_a_kill(tmp_path):

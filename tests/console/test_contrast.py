@@ -18,6 +18,10 @@ def sheet(*place):
 SHEET, CONSOLE = sheet("console", "static", "console.css")
 REPORT = sheet("data", "report.css")[1]
 BEHIND = ("--page", "--card", "--grid")  # of the page, of cards, of rows under the pointer
+DRAW = "".join(
+    f.read_text(encoding="utf-8") for f in files("ambid").joinpath("console/static").iterdir() if f.name[-3:] == ".js"
+)
+PLOTS = files("ambid").joinpath("console/static/plot.css").read_text(encoding="utf-8")
 TEXT = [(ink, back) for ink in ("--ink", "--dim", "--accent", "--good", "--doubt", "--bad") for back in BEHIND]
 TEXT += [("--on-stop", "--stop"), ("--page", "--doubt")]  # banners
 MARKS = [("--edge", "--card"), ("--edge", "--page"), ("--stop", "--page")]  # borders of what is operated
@@ -49,4 +53,12 @@ def test_text_and_marks_stand_out(colours):
     text, marks = (TEXT, MARKS) if "--card" in colours else (PRINTED, DRAWN)
     found = {pair: contrast(*(colours[c] for c in pair)) for pair in (*text, *marks)}
     assert {pair: round(x, 2) for pair, x in found.items() if x < (4.5 if pair in text else 3.0)} == {}
-    assert not re.search(r"color: #|background: #|solid #", SHEET.split("* {", 1)[1])  # no colour beside these
+    assert not re.search(r"color: #|background: #|solid #", SHEET.split("* {", 1)[1] + PLOTS)  # no colour beside these
+
+
+def test_what_scripts_draw_is_of_colours_that_stand_out():
+    used = set(re.findall(r"\"(--[\w-]+)\"", DRAW))
+    lines = set(re.findall(r"--[\w-]+", re.search(r"COLOURS = \[([^\]]*)\]", DRAW)[1]))
+    assert lines == {ink for ink, _ in TEXT} - {"--on-stop", "--page"}  # curves, on cards: as text
+    assert used - lines == {"--card", "--grid", "--line"}  # behind, beside and between
+    assert not re.search(r"#[0-9a-f]{3,6}\"|rgb\(\d|(fill|stroke)Style = \"", DRAW)

@@ -69,7 +69,7 @@ class EnvelopeTap:
         self._origin: int | None = None
         self._written_s = 0.0
         self._recent: list[Array] = []
-        self._recent_n = self._lost_told = 0
+        self._recent_n, self._lost_told = 0, (0, float("-inf"))  # samples that were told as lost, and when
         self._limits = [(k, role, line) for k, role in enumerate(view.units) for line in limits.get(role, ())]
         self._beyond: dict[int, float] = {}  # limits that were passed, and when last
         feed.tell(
@@ -140,9 +140,10 @@ class EnvelopeTap:
         assert self._origin is not None
         rate_hz = self._view.rate_hz
         t = (first - self._origin) / rate_hz
-        if self._lost > self._lost_told:
-            why = f"{self._lost - self._lost_told} samples lost"
-            self._lost_told = self._lost
+        before, then = self._lost_told
+        if self._lost > before and t - then > _INSIDE_S:
+            self._lost_told = self._lost, t
+            why = f"{self._lost - before} samples lost"
             self._feed.tell("alarm", {"t": round(t, 4), "what": "lost", "why": why})
         for j, (k, role, line) in enumerate(self._limits):
             values, at = seen[k], line["at"]

@@ -68,8 +68,8 @@ _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     "preview": ({"record": "record"}, {"rate_hz": float, "gaps": str}, ""),
     "look": (
         {"record": "record", "rig": "rig"},
-        {"from_s": float, "to_s": float, "from_hz": float, "to_hz": float, "weights": str, "channel": str,
-         "across": str, "up": str}, "",
+        {"rate_hz": float, "gaps": str, "from_s": float, "to_s": float, "from_hz": float, "to_hz": float,
+         "weights": str, "channel": str, "across": str, "up": str}, "",
     ),
     "history": ({"ledger": "ledger"}, {"bearing": str}, ""),
     "result": ({"estimate": "result"}, {}, ""),
@@ -91,7 +91,8 @@ _CHOICES = {
     "pace": ("real-time", "fastest"),
     "excitation": ("multisine", "schroeder", "prbs", "steps"),
     "method": ("pid", "lqg"),
-    "gaps": ("error", "interpolate", "cut"), "weights": tuple(WINDOWS),
+    "gaps": ("error", "interpolate", "cut"),
+    "weights": tuple(WINDOWS),
 }
 _NEEDED = {"preview": ("record",), "look": ("record",), "history": ("ledger",), "result": ("estimate",),
            "identify": ("record", "rig"),

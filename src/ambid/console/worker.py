@@ -275,6 +275,11 @@ class Worker:
             self._obeys(order, "nothing is tracked now" if asks else "this question is no longer asked")
 
 
+def _reading(worker: Worker) -> dict[str, Any]:
+    """How a record is to be read that does not say all by itself."""
+    return {k: worker.spec[k] for k in ("rate_hz", "gaps") if k in worker.spec}
+
+
 def _preview(worker: Worker) -> None:
     """Tell what a record holds, and draft its rig."""
     from ambid.console.look import look
@@ -285,7 +290,7 @@ def _preview(worker: Worker) -> None:
 
     path = worker.path("record")
     assert path is not None
-    how: dict[str, Any] = {k: worker.spec[k] for k in ("rate_hz", "gaps") if k in worker.spec}
+    how = _reading(worker)
     record = read_record(path, **how)
     worker.tick("channels")
     step = max(1, -(-record.n_samples // _PREVIEW))
@@ -333,7 +338,7 @@ def _look(worker: Worker) -> None:
     }
     pair = [worker.spec[k] for k in ("across", "up") if k in worker.spec]
     lines = {} if rig is None else limits(load_rig(rig), columns=True)
-    worker.feed.tell("look", {**look(read_record(path), orbit=pair, **asked), "limits": lines})
+    worker.feed.tell("look", {**look(read_record(path, **_reading(worker)), orbit=pair, **asked), "limits": lines})
 
 
 def _rig(worker: Worker) -> None:

@@ -96,7 +96,7 @@ export async function job(spec, tell) {
 export function wrong(host) { return (error) => host.append(el("p", { className: "refused", role: "alert" }, error.message)); }
 
 function preview(file, detail, how = {}) {
-  const host = el("div"), next = el("div"), plots = el("div"), view = recordView(file, plots);
+  const host = el("div"), next = el("div"), plots = el("div"), view = recordView(file, plots, how);
   detail.append(plots, host, next);
   job({ job: "preview", record: file.number, ...how }, (m) => {
     if (m.kind === "note") host.append(el("p", { className: "caution" }, m.text));

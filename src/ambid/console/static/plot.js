@@ -221,7 +221,7 @@ function decorate(u, made) {
   const say = (l, y, sign) => {
     g.fillStyle = css(l.words === "trip" ? "--bad" : "--doubt");
     g.textBaseline = y > top + 14 * r ? "bottom" : "top";
-    g.fillText(`${sign}${l.words} ${shown(l.at, made.signals[0].unit)}`, left + width - 3 * r, y);
+    inscribed(g, `${sign}${l.words} ${shown(l.at, made.signals[0].unit)}`, left + width - 3 * r, y);
   };
   for (const l of made.more.limits?.() ?? []) {
     const y = u.valToPos(l.at, "y", true), sign = y <= top ? "↑" : "↓";
@@ -250,7 +250,11 @@ export function upright(u, x, tint, text = "", dash = [], low = 0) {
   const g = u.ctx, y = u.bbox.top + low * u.bbox.height;
   g.save(); g.strokeStyle = g.fillStyle = tint; g.lineWidth = devicePixelRatio; g.setLineDash(dash); g.beginPath();
   g.moveTo(x, u.bbox.top); g.lineTo(x, u.bbox.top + u.bbox.height); g.stroke();
-  g.textAlign = "left"; g.textBaseline = "top"; g.fillText(text, x + 3 * devicePixelRatio, y); g.restore();
+  g.textAlign = "left"; g.textBaseline = "top"; g.setLineDash([]); inscribed(g, text, x + 3 * devicePixelRatio, y); g.restore();
+}
+function inscribed(g, text, x, y) {  // readable over whatever is drawn
+  g.save(); g.strokeStyle = css("--card"); g.lineWidth = 4 * devicePixelRatio; g.lineJoin = "round"; g.strokeText(text, x, y); g.restore();
+  g.fillText(text, x, y);
 }
 function save(name, blob) {
   el("a", { href: URL.createObjectURL(blob), download: name.replace(/[^\w.,()+-]+/g, "-") }).click();
@@ -348,14 +352,12 @@ export function waterfall(title, height, { group, turns, log = false }) {
     g.font = `${11 * r}px system-ui, sans-serif`; g.textAlign = "right"; g.textBaseline = "bottom";
     for (const k of [1, 2, 3]) {  // the speed and its multiples
       const y = seen.x.map((x, j) => u.valToPos(k * (seen.turning?.[j] ?? turns()[0] ?? NaN), "y", true));
-      for (const [tint, width] of [["--card", 4], ["--doubt", 1.5]]) {  // which stands out from every colour
-        g.strokeStyle = g.fillStyle = css(tint); g.lineWidth = width * r; g.beginPath();
+      for (const [tint, wide] of [["--card", 4], ["--doubt", 1.5]]) {  // which stands out from every colour
+        g.strokeStyle = g.fillStyle = css(tint); g.lineWidth = wide * r; g.beginPath();
         y.forEach((v, j) => isFinite(v) && g.lineTo(u.valToPos(seen.x[j], "x", true), v));
         g.stroke();
-        if (!isFinite(y.at(-1))) continue;
-        if (width > 2) g.strokeText(`${k}×`, left + u.bbox.width - 3 * r, y.at(-1));
-        else g.fillText(`${k}×`, left + u.bbox.width - 3 * r, y.at(-1));
       }
+      if (isFinite(y.at(-1))) inscribed(g, `${k}×`, left + width - 3 * r, y.at(-1));
     }
     g.restore();
   };

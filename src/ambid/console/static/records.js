@@ -4,7 +4,7 @@ import { job, wrong } from "./files.js";
 import { colour, Group, orbit, Spectra, strip, waterfall } from "./plot.js";
 
 const picked = (options) => el("select", {}, ...options.map(([value, text]) => el("option", { value }, text)));
-export function recordView(file, host) {
+export function recordView(file, host, how = {}) {
   const progress = el("div", { className: "looking" }), bar = el("div", { className: "bar" }), strips = el("div"), rest = el("div");
   const shifts = new Map();
   host.append(bar, progress, strips, rest);
@@ -44,7 +44,8 @@ export function recordView(file, host) {
     try {
       for (const f of [file, ...beside]) {
         const at = looks.find((l) => l.record === f.number), zero = at ? begin(at) : 0;
-        const spec = { job: "look", record: f.number, rig: Number(rig.value) || null, weights: weights.value, channel: channel.value,
+        const spec = { job: "look", record: f.number, ...(f === file && how), rig: Number(rig.value) || null,
+          weights: weights.value, channel: channel.value,
           ...(time.range && at && { from_s: time.range[0] + zero, to_s: time.range[1] + zero }),
           ...(hz.range && { from_hz: hz.range[0], to_hz: hz.range[1] }),
             ...(across.value && up.value && { across: across.value, up: up.value }) };
