@@ -113,7 +113,7 @@ REFUSED = {
     "rate against time": ({"time [s]": T} | PLAIN, {"rate_hz": 500.0}, "1000 Hz.*500 Hz"),
     "jitter": ({"time [s]": JITTERED} | PLAIN, {}, "row 20.*1 %"),
     "time backwards": (pd.DataFrame(PLAIN, index=T[::-1]), {}, "backwards"),
-    "time without a unit": ({"time": T} | PLAIN, {}, "'time' has no unit"),
+    "time without a unit": ({"time": 10 * T} | PLAIN, {}, "'time' has no unit.*100 Hz"),
     "time in volts": ({"time [V]": T} | PLAIN, {}, "time must be in"),
     "time twice": (pd.DataFrame({"time [s]": T} | PLAIN, index=pd.Index(T, name="t")), {}, "time twice"),
     "time alone": ({"time [s]": T}, {}, "nothing else"),

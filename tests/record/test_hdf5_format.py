@@ -82,7 +82,7 @@ def test_rate_that_contradicts_the_file(tmp_path):
 def test_foreign_and_newer_and_damaged_files_are_refused(tmp_path):
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["measurement"] = np.arange(5.0)
-    with pytest.raises(RecordError, match=r"not of ambid .* holds measurement"):
+    with pytest.raises(RecordError, match=r"no column 'time \[s\]' \(columns: measurement\)"):
         read_record(tmp_path / "foreign.h5")
     write_record(record(), tmp_path / "newer.h5")
     with h5py.File(tmp_path / "newer.h5", "a") as file:

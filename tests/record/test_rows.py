@@ -87,7 +87,7 @@ def test_rows_of_hdf5_may_hold_nan(tmp_path):
     assert (rows.record.rate_hz, rows.record.start_s, rows.time_s) == (10.0, 3.0, None)
 
 
-@pytest.mark.parametrize("name", ["r.mat", "r.txt"])
+@pytest.mark.parametrize("name", ["r.mat", "r.xyz"])
 def test_other_formats_are_refused(tmp_path, name):
     with pytest.raises(RecordError, match="csv"):
         read_rows(tmp_path / name)

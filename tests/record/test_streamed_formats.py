@@ -188,8 +188,9 @@ def test_arrow_time_and_missing_values(tmp_path):
         read_record(path)
     record = read_record(path, gaps="cut")
     assert (record.rate_hz, record.start_s, record["n"].unit, record["n"].values[0]) == (2000.0, 5e-4, "?", 1.0)
-    with pytest.raises(RecordError, match=r"'time' has no unit"):
-        read_record(table(path, {"time": time, "u": U}))
+    with pytest.raises(RecordError, match=r"'time' has no unit.* count samples"):
+        read_record(table(path, {"time": 2 * time, "u": U}))
+    assert read_record(table(path, {"Zeit": time * 1e-3, "u": U})).rate_hz == 2000.0
     with pytest.raises(RecordError, match=r"advances by 9"):
         read_record(table(path, {"time [s]": np.where(time > 50, time + 4, time), "u": U}))
 

@@ -47,7 +47,7 @@ def test_wrong_unit_gives_the_remedy(tmp_path):
 
 @pytest.mark.parametrize(
     ("header", "said"),
-    [("position", "has no unit"), ("position [micron]", r"\[micron\], an unknown unit")],
+    [("position", "has no unit"), ("position [furlong]", r"\[furlong\], an unknown unit")],
 )
 def test_column_without_a_known_unit_cannot_be_used(tmp_path, header, said):
     with pytest.raises(UnitError, match=said + r".*position \[unit\].*channels\.position\.unit"):

@@ -88,8 +88,8 @@ def read_record(
         return read_table(source, rate_hz=rate_hz, units=units, gaps=gaps)
     path = Path(source)
     kind, layout = _format_of(path), dict(layout or {})
-    if variables is not None and kind != "mat":
-        raise RecordError(f"{path}: a mapping of variables is for .mat files. Omit it")
+    if variables is not None and kind not in NAMED:
+        raise RecordError(f"{path}: a mapping of variables is for .mat files and arrays by name. Omit it")
     _check_layout(kind, layout, path)
     if kind == "csv":
         return read_csv(path, rate_hz=rate_hz, gaps=gaps, layout=layout)
@@ -98,12 +98,18 @@ def read_record(
 
         return read_mat(path, variables=variables, rate_hz=rate_hz, gaps=gaps, layout=layout)
     if kind == "hdf5":
-        from ambid.record.hdf5_format import read_hdf5
+        from ambid.record.hdf5_format import is_own, read_hdf5
 
-        return checked(read_hdf5(path), f"record {path}", rate_hz, gaps)
+        if is_own(path):
+            return checked(read_hdf5(path), f"record {path}", rate_hz, gaps)
+        from ambid.record.array_formats import read_foreign_hdf5
+
+        return read_foreign_hdf5(path, variables=variables, rate_hz=rate_hz, gaps=gaps, layout=layout)
     check_gap_policy(gaps)
-    reader: Any = getattr(import_module("ambid.record.library_formats"), f"read_{kind}")
-    return reader(path, layout=layout, rate_hz=rate_hz, gaps=gaps)  # type: ignore[no-any-return]
+    room = "array_formats" if kind in ("numpy", "xlsx") else "library_formats"
+    reader: Any = getattr(import_module(f"ambid.record.{room}"), f"read_{kind}")
+    named = {"variables": variables} if kind == "numpy" else {}
+    return reader(path, layout=layout, rate_hz=rate_hz, gaps=gaps, **named)  # type: ignore[no-any-return]
 
 
 def _check_layout(kind: str, layout: Mapping[str, str], path: Path) -> None:
@@ -194,19 +200,27 @@ def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = 
 
 
 _SUFFIXES = {
-    ".csv": "csv", ".csv.gz": "csv", ".h5": "hdf5", ".hdf5": "hdf5", ".mat": "mat", ".tdms": "tdms", ".mf4": "mdf",
-    ".mdf": "mdf", ".parquet": "parquet", ".feather": "parquet", ".arrow": "parquet",
+    ".csv": "csv", ".csv.gz": "csv", ".txt": "csv", ".dat": "csv", ".lvm": "csv", ".tsv": "csv", ".asc": "csv",
+    ".h5": "hdf5", ".hdf5": "hdf5", ".mat": "mat", ".fig": "mat", ".npz": "numpy", ".npy": "numpy", ".xlsx": "xlsx",
+    ".xlsm": "xlsx", ".tdms": "tdms", ".mf4": "mdf", ".mdf": "mdf", ".parquet": "parquet", ".feather": "parquet",
+    ".arrow": "parquet",
 }  # fmt: skip
 
 ENDINGS = tuple(_SUFFIXES)
 """How names of records end that can be read."""
 
+NAMED = ("mat", "numpy", "hdf5")
+"""Formats in which variables are named by their paths."""
+
 LAYOUTS = {
-    "csv": ("decimal", "separator", "thousands", "units", "encoding"),
+    "csv": ("decimal", "separator", "thousands", "units", "encoding", "time", "time_unit"),
+    "xlsx": ("sheet", "decimal", "thousands", "units", "time", "time_unit"),
+    "numpy": ("group", "channels", "time", "time_unit"),
+    "hdf5": ("group", "channels", "time", "time_unit"),
     "tdms": ("group", "channels"),
     "mdf": ("group", "channels"),
     "parquet": ("channels",),
-    "mat": ("group", "channels", "units", "values"),
+    "mat": ("group", "channels", "units", "values", "time", "time_unit"),
 }
 """Words by which the layout of a file is told, by format."""
 

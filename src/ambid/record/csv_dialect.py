@@ -9,18 +9,19 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from ambid.errors import RecordError, UnitError
+from ambid.errors import RecordError
 from ambid.record.record import utf8_text
+from ambid.record.words import is_time, label_of, quantities, unit_or_none
 from ambid.settings.caller import setting
-from ambid.units import parse_unit
 
 _WORDS = {
     "decimal": {",": ",", "comma": ",", ".": ".", "point": "."},
-    "separator": {",": ",", "comma": ",", ";": ";", "semicolon": ";", "\t": "\t", "tab": "\t"},
+    "separator": {",": ",", "comma": ",", ";": ";", "semicolon": ";", "\t": "\t", "tab": "\t", " ": " ", "blank": " "},
     "thousands": {",": ",", "comma": ",", ".": ".", "point": ".", " ": " ", "space": " ", "'": "'", "apostrophe": "'"},
     "units": {x: x for x in ("row", "parentheses", "brackets", "none")},
-    "encoding": {x: x for x in ("utf-8", "utf-16", "utf-16-le", "utf-16-be", "latin-1", "cp1252")},
+    "encoding": {x: x for x in ("cp932", "gb18030", "utf-8", "utf-16", "utf-16-le", "utf-16-be", "latin-1", "cp1252")},
 }
 _MARKS = str.maketrans("\u2019\u00a0\u202f", "'  ")
 _POWER = r"(?:[eE][+-]?\d+)?"
@@ -29,6 +30,11 @@ _THOUSANDS = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:,\d{{3}})+(?:\.\d*)?{_POWER}")
 _NUMBER = re.compile(rf"[+-]?(?:\d{{1,3}}(?:[.,' ]\d{{3}})+|\d*)(?:[.,]\d*)?{_POWER}")
 _PARENTHESES = re.compile(r"(?P<name>.*\S)\s*\((?P<unit>[^()]*)\)")
 _SPACED = re.compile("\\d([' \u00a0\u202f\u2019])\\d")
+_NAMED_NUMBER = re.compile(
+    rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d*[.,]?\d+{_POWER})\s*[,;\t]?\s*"
+    r"(?P<unit>[A-Za-zµμ]{0,3})"
+)
+_HEAD = 1 << 14  # bytes in which the words of an encoding are looked for
 _FEW = 8  # rows of numbers below a header, without which a text is no table
 
 
@@ -40,26 +46,48 @@ class Dialect:
     delimiter: str
     cells: tuple[str, ...]  # of the header row
     units: tuple[str | None, ...] | None  # where they are not behind the names in brackets
+    texts: Mapping[str, Sequence[str]]  # columns that hold no numbers
+    beside: Mapping[str, tuple[float, str | None]]  # numbers above the table, with their units
     comments: tuple[str, ...]
     lines: list[str]  # of the whole file; numbers with a decimal point
     settings: Mapping[str, object]  # what was understood
 
 
 def decoded(data: bytes, path: Path, layout: Mapping[str, str]) -> tuple[str, str]:
-    """Return the text and its encoding: the one that is told, UTF-16 by its mark, else UTF-8."""
-    encoding = words_of(layout, path).get("encoding", "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8")
+    """Return the text and its encoding: the one that is told, UTF-16 by its mark or its zeros, UTF-8, else the older
+    one in which the head names most quantities.
+    """
+    marked = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    zeros = [not marked and len(data) > 16 and not any(data[k : 1 << 12 : 2][:-1]) for k in (1, 0)]
+    usual = "utf-16" if marked else "utf-16-le" if zeros[0] else "utf-16-be" if zeros[1] else "utf-8"
+    encoding = words_of(layout, path).get("encoding", usual)
+    if encoding == "utf-8" and "encoding" not in layout and not _is_utf8(data):
+        heads = {name: data[:_HEAD].decode(name, "replace") for name in ("cp1252", "cp932", "gb18030")}
+        count = {name: sum(bool(quantities(x)) for x in re.split(r"[\s,;]+", text)) for name, text in heads.items()}
+        best = max(heads, key=lambda name: (count[name], name == "cp1252"))
+        encoding = "latin-1" if best == "cp1252" else best
     if encoding == "utf-8":
         return utf8_text(data, path), encoding
     try:
-        return utf8_text(data.decode(encoding).encode(), path), encoding
+        return utf8_text(data.decode("cp1252" if encoding == "latin-1" else encoding).encode(), path), encoding
     except UnicodeDecodeError:
         raise RecordError(f"record {path} is no text in {encoding}. Correct layout encoding") from None
+
+
+def _is_utf8(data: bytes) -> bool:
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def words_of(layout: Mapping[str, str], path: Path) -> dict[str, str]:
     """Return a layout in signs: ``comma`` is ``,`` and so on."""
     words = {}
     for word, value in layout.items():
+        if word not in _WORDS:
+            continue
         if value.lower() not in _WORDS[word]:
             raise RecordError(f"{path}: layout {word}={value!r}; it is one of {', '.join(_WORDS[word])}. Correct it")
         words[word] = _WORDS[word][value.lower()]
@@ -72,32 +100,45 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
     """Recognise a dialect; None where the text is usual, or no table. Raises where it could be read in two ways."""
     words = words_of(layout, path)
     begin = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
-    table = None if begin is None else _table(lines, begin, words.get("separator"))
-    if begin is None or table is None:
+    block = None if begin is None else _first_block(lines, words.get("separator"))
+    if begin is None or block is None:
         return None
-    at, delimiter, n = table
-    above = [k for k in range(begin, at) if lines[k].strip() and not lines[k].startswith("#")]
-    heads = [_cells(lines[k], delimiter) for k in above]
-    if not heads or not _is_header(heads[-1], n):
+    heads = _heads(lines, block, path, words.get("units"))
+    if heads is None:
         return None
-    header, units = _names_and_units(heads, above, n, path, words.get("units"))
-    cells = heads[above.index(header)]
-    settings: dict[str, object] = {}
-    if units is not None:
-        settings["units"] = "row"
-    elif (parsed := _in_parentheses(cells, header, path, words.get("units"))) is not None:
-        cells, units = parsed
-        settings["units"] = "parentheses"
-    if header != begin:
-        settings["preamble"] = above.index(header)
+    at, delimiter, settings = block.at, block.delimiter, dict(heads.settings)
+    if block.blank:
+        lines, delimiter = [*lines[:at], *("\t".join(x.split()) for x in lines[at:])], "\t"
     body, marks = _plain_numbers(lines, at, delimiter, path, words)
+    if block.blank:
+        marks["delimiter"] = " "
     settings |= marks
-    if not (settings or words):
+    if heads.row is not None and heads.row != begin and not lines[begin].startswith("%"):
+        settings["preamble"] = sum(bool(x.strip()) and not x.startswith("#") for x in lines[begin : heads.row])
+    if any(x.startswith("%") for x in lines[:at]):
+        settings["comments"] = "%"
+    names, units, texts = list(heads.names), None if heads.units is None else list(heads.units), {}
+    if any(kind != "number" for kind in block.kinds):
+        rows = [_cells(line, delimiter) for line in body[at:] if line.strip()]
+        ragged = next((k for k, row in enumerate(rows) if len(row) != len(block.kinds)), None)
+        if ragged is not None:
+            raise RecordError(
+                f"{path}, row {at + 1 + ragged}: {len(rows[ragged])} cells instead of {len(block.kinds)}. Correct the "
+                "row, or remove it if it was cut off"
+            )
+        columns = dict(enumerate(zip(*rows, strict=True)))
+        keep = [j for j, kind in enumerate(block.kinds) if kind == "number" or (kind == "empty" and any(columns[j]))]
+        texts = {names[j]: columns[j] for j, kind in enumerate(block.kinds) if kind == "text"}
+        body = [*body[:at], *(delimiter.join(row[j] for j in keep) for row in rows)]
+        names, units = [names[j] for j in keep], None if units is None else [units[j] for j in keep]
+        settings |= {"left_out": list(texts)} if texts else {"empty": len(block.kinds) - len(keep)}
+    elif not (settings or words):
         return None
-    comments = [x.lstrip("#").strip() for k, x in enumerate(lines[:at]) if x.strip() and k not in (header, above[-1])]
+    used = {heads.row, *heads.below}
+    comments = [x.lstrip("#%").strip() for k, x in enumerate(lines[:at]) if x.strip() and k not in used]
     return Dialect(
-        row=at, delimiter=delimiter, cells=tuple(cells), units=None if units is None else tuple(units),
-        comments=tuple(comments), lines=body, settings=settings,
+        row=at, delimiter=delimiter, cells=tuple(names), units=None if units is None else tuple(units), texts=texts,
+        comments=tuple(comments), lines=body, settings=settings, beside={**_beside(lines[:at]), **heads.beside},
     )  # fmt: skip
 
 
@@ -112,50 +153,189 @@ def _is_number(cell: str) -> bool:
     return any(map(str.isdigit, text)) and _NUMBER.fullmatch(text) is not None
 
 
-def _is_header(cells: Sequence[str], n: int) -> bool:
-    texts = len(cells) == n and all(x and not _is_number(x) for x in cells)
-    return texts and len(set(cells)) == n
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Block:
+    """The first rows of numbers."""
+
+    at: int  # their place, counted from 0
+    delimiter: str
+    kinds: tuple[str, ...]  # of each column: number, text or empty
+    blank: bool  # separated by blanks, several of which are one
 
 
-def _table(lines: Sequence[str], begin: int, word: str | None) -> tuple[int, str, int] | None:
-    """Find the first rows of numbers of one width: their place, delimiter and width."""
-    for k in range(begin + 1, min(len(lines), begin + 1000)):
-        for delimiter in (word,) if word else ("\t", ";", ","):
-            cells = _cells(lines[k], delimiter)
-            if (len(cells) > 1 or word) and all(map(_is_number, cells)):
-                rows = [_cells(line, delimiter) for line in lines[k : k + _FEW]]
-                if len(rows) == _FEW and all(len(row) == len(cells) and any(map(_is_number, row)) for row in rows):
-                    return k, delimiter, len(cells)
+def _first_block(lines: Sequence[str], word: str | None) -> _Block | None:
+    """Find the first rows of one width that hold two columns of numbers, or one where the separator is told."""
+    for k in range(min(len(lines), 1000)):
+        for delimiter in (word,) if word else ("\t", ";", " ", ","):
+            cells = _split(lines[k], delimiter)
+            if sum(map(_is_number, cells)) < (1 if word else 2):
+                continue
+            rows = [_split(line, delimiter) for line in lines[k : k + _FEW]]
+            if len(rows) < _FEW or any(len(row) != len(cells) or not any(map(_is_number, row)) for row in rows):
+                continue
+            kinds = tuple(map(_kind, zip(*rows, strict=True)))
+            first = all(_is_number(x) or kind != "number" or not x for x, kind in zip(cells, kinds, strict=True))
+            if first and kinds.count("number") >= (1 if word else 2):
+                return _Block(at=k, delimiter=delimiter, kinds=kinds, blank=delimiter == " ")
     return None
 
 
-def _names_and_units(
-    heads: Sequence[list[str]], above: Sequence[int], n: int, path: Path, word: str | None
-) -> tuple[int, list[str | None] | None]:
-    """Return the line of the names, counted from 0, and the units of a row below them."""
-    texts = [x.strip("[]()") for x in heads[-1]]
-    doubtful = len(heads) > 1 and _is_header(heads[-2], n)
-    if word == "row":
-        if not doubtful:
-            raise RecordError(f"{path}, row {above[-1] + 1}: no names stand above these units. Correct the layout")
-        return above[-2], list(texts)
-    if doubtful and word is None:
-        if all(map(_is_unit, texts)) and not any("[" in x for x in heads[-2]):
-            return above[-2], list(texts)
-        raise RecordError(
-            f"{path}: rows {above[-2] + 1} and {above[-1] + 1} may both hold the names. Say whether the second holds "
-            f"units: {setting('layout', 'units=row')}, or {setting('layout', 'units=none')}"
-        )
-    return above[-1], None
+def _split(line: str, delimiter: str) -> list[str]:
+    """Take a row of numbers apart; blanks separate where nothing else does."""
+    if delimiter != " ":
+        return _cells(line, delimiter)
+    cells = line.split()
+    return cells if all(map(_is_number, cells)) and not any(x.endswith((",", ";")) for x in cells) else []
+
+
+def _kind(column: Sequence[str]) -> str:
+    """Return what a column holds; a single cell that is none does not make it other than of numbers."""
+    numbers = sum(_is_number(x) or x.lower().lstrip("+-") in ("nan", "inf") for x in column)
+    empty = sum(not x for x in column)
+    return "number" if numbers >= 2 or numbers + empty == _FEW > empty else "empty" if empty == _FEW else "text"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Heads:
+    """What the rows above the numbers say."""
+
+    row: int | None  # line of the names, counted from 0; None: there is none
+    below: tuple[int, ...]  # further lines between it and the numbers
+    names: tuple[str, ...]
+    units: tuple[str | None, ...] | None
+    settings: Mapping[str, object]
+    beside: Mapping[str, tuple[float, str | None]]
+
+
+def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) -> _Heads | None:
+    """Find names and units above the numbers; None where the row above them is a header of another form."""
+    n, rows, k = len(block.kinds), list[tuple[int, list[str]]](), block.at - 1
+    while k >= 0 and len(rows) < 3:  # names, units, and what explains them
+        line = lines[k].lstrip("#%").strip(" ") if lines[k].startswith(("#", "%")) else lines[k]
+        if line.strip():
+            cells = _head_cells(line, block, n)
+            if cells is None:
+                break
+            rows.insert(0, (k, cells))
+        k -= 1
+    above = next((x for x in reversed(lines[: block.at]) if x.strip() and not x.startswith(("#", "%"))), "")
+    cells = _cells(above, block.delimiter if not block.blank else "\t")
+    if sum(map(_is_number, cells)) > 1 and not any(lines[j] is above for j, _ in rows):
+        return None  # numbers of another form: what is wrong with them is told where rows are read
+    if not rows and above and (len(cells) > 1 or "[" in above or any(x in above for x in ",;\t")):
+        return None
+    if word == "row" and len(rows) < 2:
+        raise RecordError(f"{path}, row {block.at}: no names stand above these units. Correct the layout")
+    lvm = _labview(lines[: block.at], rows[-1][1]) if rows else None
+    units_at = _units_row([c for _, c in rows], word)
+    if units_at is None and word is None and len(rows) > 1 and rows[-1][1] != rows[-2][1]:
+        if not lines[rows[-2][0]].startswith(("#", "%")):
+            raise RecordError(
+                f"{path}: rows {rows[-2][0] + 1} and {rows[-1][0] + 1} may both hold the names. Say whether the second "
+                f"holds units: {setting('layout', 'units=row')}, or {setting('layout', 'units=none')}"
+            )
+        rows = rows[-1:]
+    names_at = len(rows) - 1 if units_at is None else units_at - 1
+    beside: dict[str, tuple[float, str | None]] = {}
+    settings: dict[str, object] = {}
+    units: list[str | None] | None = None
+    if units_at is not None:
+        texts = rows[units_at][1]
+        units = [x.strip("[]()") or None for x in texts]
+        settings["units"] = "row"
+    if names_at < 0 or not rows:
+        names, row = [f"column {j + 1}" for j in range(n)], None
+        settings["header"] = "none"
+    else:
+        row, names = rows[names_at]
+        if units_at is not None:  # numbers among the units belong to the names above them
+            beside = {
+                a: (float(b), None) for a, b in zip(names, rows[units_at][1], strict=True) if a and _plain_float(b)
+            }
+        elif (parsed := _in_parentheses(names, row, path, word)) is not None:
+            names, units = parsed
+            settings["units"] = "parentheses"
+        elif word is None and all(names) and any(label_of(x)[1] for x in names) and not any("[" in x for x in names):
+            names, units = map(list, zip(*map(label_of, names), strict=True))
+            settings["units"] = "behind"
+    if lvm is not None:
+        units, beside = [*lvm[0], *[None] * n][:n] if units is None else units, {**beside, **lvm[1]}
+    counted = [x or f"column {j + 1}" for j, x in enumerate(names)]
+    doubled = [x for j, x in enumerate(counted) if x in counted[:j] and is_time(x)]
+    for x in doubled:  # every column of LabVIEW may have its own time
+        for m, j in enumerate([j for j, y in enumerate(counted) if y == x][1:], 2):
+            counted[j] = f"{x} {m}"
+    if doubled or "" in names:
+        settings["header"] = "incomplete"
+    elif row is not None and lines[row].startswith(("#", "%")):
+        settings["header"] = "comment"
+    return _Heads(
+        row=row, below=tuple(k for k, _ in rows if k != row), names=tuple(counted),
+        units=None if units is None else tuple(units), settings=settings, beside=beside,
+    )  # fmt: skip
+
+
+def _head_cells(line: str, block: _Block, n: int) -> list[str] | None:
+    """Take a row above the numbers apart; None where it is none of `n` names or units."""
+    if block.blank or block.delimiter == "\t":
+        ways = [line.split("\t"), re.split(r"\t|\s{2,}", line.strip()), re.split(r"\s+(?![\[(])", line.strip())]
+        cells = next(([x.strip() for x in way] for way in ways if len(way) in (n, n + 1)), [])
+    else:
+        cells = _cells(line, block.delimiter)
+    cells = cells[:n] if len(cells) == n + 1 and cells[n].lower() == "comment" else cells
+    texts = [x for x, kind in zip(cells, block.kinds, strict=False) if kind == "number"]
+    if len(cells) != n or not any(texts) or (any(map(_is_number, texts)) and not _numbered(texts)):
+        return None
+    return [x.strip('"').strip() for x in cells]
+
+
+def _numbered(texts: Sequence[str]) -> bool:
+    """Whether channels are named 1, 2, 3 beside a name that is none, as oscilloscopes do."""
+    numbers = [x for x in texts if _is_number(x)]
+    return len(numbers) < len(texts) and numbers == [str(k + 1) for k in range(len(numbers))]
+
+
+def _plain_float(text: str) -> bool:
+    return re.fullmatch(rf"[+-]?\d*\.?\d+{_POWER}", text) is not None
+
+
+def _units_row(rows: Sequence[Sequence[str]], word: str | None) -> int | None:
+    """Return which row holds units: most of its texts are known ones, and nothing above it has any in brackets."""
+    if word is not None:
+        return len(rows) - 1 if word == "row" else None
+    for k, cells in enumerate(rows):
+        texts = [x.strip("[]()") for x in cells if x and not _plain_float(x)]
+        if sum(map(_is_unit, texts)) > len(texts) / 2 and not any("[" in x for row in rows[:k] for x in row):
+            named = sum(bool(quantities(x)) and len(x) == 1 for x in texts)  # t u i x may be names, s V A m are not
+            if k > 0 or named < len(texts) / 2:
+                return k
+    return None
+
+
+def _labview(lines: Sequence[str], names: Sequence[str]) -> tuple[list[str | None], dict[str, Any]] | None:
+    """Return units and interval of the head of a LabVIEW measurement file, units in the order of its names."""
+    marks = {x.split("\t")[0].strip(): x.split("\t")[1:] for x in lines if "\t" in x}
+    if not any("End_of_Header" in x for x in lines):
+        return None
+    texts = iter([x.strip() for x in marks.get("Y_Unit_Label", []) if x.strip()])
+    units = ["s" if x.startswith("X_Value") else next(texts, None) for x in names]
+    interval = marks.get("Delta_X", [""])[0].strip().replace(",", ".")
+    return units, {"Delta_X": (float(interval), "s")} if _plain_float(interval) else {}
+
+
+def _beside(lines: Sequence[str]) -> dict[str, tuple[float, str | None]]:
+    """Return the numbers that the lines above the table name, with their units."""
+    pairs: dict[str, tuple[float, str | None]] = {}
+    for line in lines:
+        match = _NAMED_NUMBER.fullmatch(line.lstrip("#%").strip().rstrip(",;\t "))
+        if match:
+            pairs[match["name"].strip()] = (float(match["number"].replace(",", ".")), match["unit"] or None)
+    return pairs
 
 
 def _is_unit(text: str) -> bool:
     """Whether a text is a known unit and no number."""
-    try:
-        parse_unit(text)
-    except UnitError:
-        return False
-    return not text.isdigit()
+    return not text.isdigit() and unit_or_none(text) is not None
 
 
 def _in_parentheses(

@@ -7,7 +7,7 @@ from __future__ import annotations
 import gzip
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -15,19 +15,19 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
+from ambid.record.clock import TIME_NAMES, Clock, clock_of, dates, rises, seconds, unit_words
 from ambid.record.csv_dialect import decoded, recognised
 from ambid.record.record import Record, file_bytes, gunzipped, sha256_of
 from ambid.record.sampling import (
     MIN_SAMPLES,
-    TIME_NAMES,
     GapPolicy,
     Rows,
     Table,
     check_gap_policy,
     record_of_rows,
-    seconds,
     uniform_record,
 )
+from ambid.record.words import label_of
 from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 
@@ -45,7 +45,8 @@ def read_csv(
     unit is ``"?"``. `rate_hz`: for a file without a column ``time [s]``.
     """
     check_gap_policy(gaps)
-    return uniform_record(_table(Path(path), gaps, layout), rate_hz, gaps)
+    table, rate = _table(Path(path), gaps, layout, rate_hz)
+    return uniform_record(table, rate, gaps)
 
 
 def read_csv_rows(
@@ -54,11 +55,11 @@ def read_csv_rows(
     """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.sampling.Rows`); as
     `read_csv`.
     """
-    return record_of_rows(_table(Path(path), "cut", layout), rate_hz)
+    return record_of_rows(*_table(Path(path), "cut", layout, rate_hz))
 
 
-def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
-    """Read the header and the numbers, time in s."""
+def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str], rate_hz: float | None) -> tuple[Table, float | None]:
+    """Read the header and the numbers, time in s; and the rate, where it is given or stands above the numbers."""
     data = file_bytes(path)
     provenance = {"file": path.name, "sha256": sha256_of(data)}
     if path.suffix.lower() == ".gz":
@@ -67,39 +68,101 @@ def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
             raise RecordError(f"record {path} is empty inside its gzip wrapping. Export or copy it again")
     elif data[:2] == b"\x1f\x8b":
         raise RecordError(f"record {path} is gzipped although its name does not say so. Rename it to {path.name}.gz")
-    plain, encoding = None if layout else read_plain(data, path), "utf-8"
-    layout_found: Mapping[str, object] = {}
-    if plain is None:
-        text, encoding = decoded(data, path, layout)
-        lines = text.split("\n")
-        del data, text
-        dialect = recognised(lines, path, layout)
-        if dialect is None:
-            header = find_header(lines, path)
-        else:
-            names, units = _names_and_units(dialect.cells, dialect.row, path)
-            header = Header(
-                row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments,
-                unit_texts=units if dialect.units is None else dialect.units,
-            )  # fmt: skip
-            lines, layout_found = dialect.lines, dialect.settings
-        values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
+    plain = None if layout else read_plain(data, path)
+    if plain is not None:
+        return table_of(path, *plain, provenance, {}, rate_hz)
+    text, encoding = decoded(data, path, layout)
+    lines = text.split("\n")
+    del data, text
+    told = {"encoding": encoding} if encoding != "utf-8" else {}
+    return table_of_lines(lines, path, gaps, layout, rate_hz, provenance, told)
+
+
+def table_of_lines(
+    lines: list[str], path: Path, gaps: GapPolicy, layout: Mapping[str, str], rate_hz: float | None,
+    provenance: dict[str, str], told: Mapping[str, object],
+) -> tuple[Table, float | None]:  # fmt: skip
+    """Read a text, line by line; `told`: what its reading has told so far, for the history."""
+    dialect = recognised(lines, path, layout)
+    beside: Mapping[str, tuple[float, str | None]] = {}
+    texts: Mapping[str, Sequence[str]] = {}
+    if dialect is None:
+        header = find_header(lines, path)
     else:
-        header, values = plain
+        names, units = _names_and_units(dialect.cells, dialect.row, path)
+        header = Header(
+            row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments,
+            unit_texts=units if dialect.units is None else tuple(map(_either, dialect.units, units)),
+        )  # fmt: skip
+        lines, told, beside, texts = dialect.lines, {**dialect.settings, **told}, dialect.beside, dialect.texts
+    values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
+    if (long := pivoted(header.names, header.unit_texts, values, texts)) is not None:
+        names, units, values = long
+        header, told = replace(header, names=names, unit_texts=units), {**told, "long": True}
+    return table_of(path, header, values, provenance, {**told, **({"layout": dict(layout)} if layout else {})}, rate_hz,
+                    beside, texts)  # fmt: skip
+
+
+def _either(below: str | None, behind: str | None) -> str | None:
+    return behind if below is None else below
+
+
+def table_of(
+    path: Path, header: Header, values: Array, provenance: dict[str, str], told: Mapping[str, object],
+    rate_hz: float | None, beside: Mapping[str, tuple[float, str | None]] = MappingProxyType({}),
+    texts: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> tuple[Table, float | None]:  # fmt: skip
+    """Find time among the columns."""
     if header.comments:
         provenance["comment"] = "\n".join(header.comments)
-    time = next((j for j, name in enumerate(header.names) if name.lower() in TIME_NAMES), None)
-    if time is not None:
-        place = f"{path}, row {header.row}"
-        values[:, time] = seconds(values[:, time], header.names[time], header.unit_texts[time], place)
+    layout, place = told.get("layout"), f"{path}, row {header.row}"
+    layout = layout if isinstance(layout, Mapping) else {}
+    names, units = header.names, header.unit_texts
+    clock = clock_of(names, units, list(values.T), where=str(path), rate_hz=rate_hz, beside=beside, layout=layout)
     settings: dict[str, object] = {"format": "csv", "rows": values.shape[0]}
     settings |= {"delimiter": header.delimiter} if header.delimiter != "," else {}
-    settings |= {**layout_found, **({"encoding": encoding} if encoding != "utf-8" else {})}
-    settings |= {"layout": dict(layout)} if layout else {}
-    return Table(
-        where=str(path), names=header.names, unit_texts=header.unit_texts, values=values, first_row=header.row + 1,
-        time=time, provenance=provenance, settings=settings,
+    settings |= told
+    if clock.column is not None:
+        name, unit = names[clock.column], units[clock.column]
+        why = [clock.why, unit_words(values[:, clock.column], name, unit) if rate_hz is None else ""]
+        values[:, clock.column] = seconds(values[:, clock.column], name, unit, place, layout, rate_hz)
+        settings |= {"time": ", ".join(filter(None, why))} if any(why) else {}
+    elif clock.rate_hz is not None:
+        settings["time"], rate_hz = clock.why, clock.rate_hz
+    elif rate_hz is None and (stamps := next(((k, x) for k, t in texts.items() if (x := dates(t)) is not None), None)):
+        names, units, values = (stamps[0], *names), ("s", *units), np.column_stack([stamps[1], values])
+        clock, settings["time"] = Clock(column=0), f"{stamps[0]!r}, because it holds dates"
+    table = Table(
+        where=str(path), names=names, unit_texts=units, values=values, first_row=header.row + 1,
+        time=clock.column, provenance=provenance, settings=settings,
     )  # fmt: skip
+    return table, rate_hz
+
+
+def pivoted(
+    names: Sequence[str], units: Sequence[str | None], values: Array, texts: Mapping[str, Sequence[str]]
+) -> tuple[tuple[str, ...], tuple[str | None, ...], Array] | None:
+    """Turn a long table, rows of time, name and value, into one of columns; None where it is none."""
+    if values.shape[1] != 2 or not texts:
+        return None
+    key = next((k for k, x in texts.items() if 1 < len(set(x)) < 33 and len(x) % len(set(x)) == 0), None)
+    if key is None:
+        return None
+    labels = np.array(texts[key])
+    own = {label: values[labels == label] for label in dict.fromkeys(texts[key])}
+    first = next(iter(own.values()))
+    for at in (0, 1):
+        if rises(first[:, at]) and all(
+            x.shape == first.shape and np.array_equal(x[:, at], first[:, at]) for x in own.values()
+        ):
+            unit = {label: x[np.flatnonzero(labels == label)[0]] for label in own for k, x in texts.items() if k != key}
+            parts = [label_of(label) for label in own]
+            found = [u or unit.get(label) or None for label, (_, u) in zip(own, parts, strict=True)]
+            return (
+                (names[at], *(name for name, _ in parts)), (units[at], *found),
+                np.column_stack([first[:, at], *(x[:, 1 - at] for x in own.values())]),
+            )  # fmt: skip
+    return None
 
 
 def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:
@@ -169,8 +232,7 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
     cells = [cell.strip().strip('"').strip() for cell in line.split(delimiter)]
     if all(np.isfinite(_number(cell)) for cell in cells):
         raise RecordError(
-            f"{path}, row {row}: numbers instead of the header row. Write one row of 'name [unit]' before them, "
-            "without '#'"
+            f"{path}, row {row}: numbers instead of the header row. Write one row of 'name [unit]' before them"
         )
     names, units = _names_and_units(cells, row, path)
     return Header(row=row, delimiter=delimiter, names=names, unit_texts=units, comments=tuple(comments))

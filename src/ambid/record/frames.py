@@ -5,7 +5,6 @@ becomes one: what comes in is known by the module of its class. The rules are th
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -15,20 +14,19 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError, nearest
+from ambid.record.clock import TIME_NAMES, seconds
 from ambid.record.record import Channel, Record
 from ambid.record.sampling import (
-    TIME_NAMES,
     GapPolicy,
     Rows,
     Table,
     record_of_rows,
     refuse_gaps,
-    seconds,
     uniform_record,
 )
+from ambid.record.words import is_time, label_of
 from ambid.units import UNKNOWN
 
-_LABEL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
 _EXACT = 2.0**53  # beyond it a float64 does not hold every whole number
 _TABLES = (("pandas", "DataFrame"), ("polars", "DataFrame"), ("xarray", "Dataset"))
 _REMEDIES = {
@@ -105,12 +103,6 @@ def imported(name: str, what: str, extra: str = "frames") -> Any:
         return import_module(name)
     except ImportError:
         raise RecordError(f"{name} is not installed, and {what} needs it. Install {name}, or ambid[{extra}]") from None
-
-
-def label_of(label: str) -> tuple[str, str | None]:
-    """Return name and unit of a column that is called ``name [unit]``."""
-    match = _LABEL.fullmatch(label.strip())
-    return (match["name"].strip(), match["unit"].strip()) if match else (label.strip(), None)
 
 
 def _class_of(x: object) -> tuple[str, str]:
@@ -205,7 +197,7 @@ def _table(parts: _Parts, units: Mapping[str, str] | None) -> Table:
         if name in names:
             raise RecordError(f"{parts.what} has column {name!r} twice; names must differ. Rename one")
         values = _plain(column.values)
-        if name.lower() in TIME_NAMES:
+        if is_time(name) and (time is None or name.lower() in TIME_NAMES):
             time, text = len(names), _time_text(values, text)
         names.append(name)
         texts.append(text)
@@ -297,14 +289,14 @@ def _index(parts: _Parts, index: _Column, units: dict[str, str]) -> tuple[str | 
     values = _plain(index.values)
     labelled = index.label is not None
     name, text = _named(parts.what, index, units) if labelled else ("time", None)
-    if values.dtype.kind in "iu" and not (labelled and name.lower() in TIME_NAMES):
+    if values.dtype.kind in "iu" and not (labelled and is_time(name)):
         if values.size > 1 and np.ptp(np.diff(values)):
             raise RecordError(
                 f"the index of {parts.what} jumps: rows are missing, or were put together. Treat them as a gap with a"
                 " column 'time [s]', or reset_index(drop=True) where none is missing"
             )
         return None
-    if values.dtype.kind not in "iufmM" or (labelled and name.lower() not in TIME_NAMES and values.dtype.kind in "f"):
+    if values.dtype.kind not in "iufmM" or (labelled and not is_time(name) and values.dtype.kind in "f"):
         called = f" {index.label!r}" if labelled else ""
         raise RecordError(
             f"the index{called} of {parts.what} is no time: it has to hold seconds, time differences or dates, and be"

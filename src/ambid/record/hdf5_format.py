@@ -197,6 +197,15 @@ def hdf5_of(path: Path) -> Iterator[Any]:
         yield file
 
 
+def is_own(path: Path) -> bool:
+    """Whether a file may be one of ambid, or is none at all; an HDF5 file of another program has no schema."""
+    try:
+        with hdf5_of(path) as file:
+            return "schema" in file.attrs or not len(file) or "channels" in file
+    except (OSError, RuntimeError):
+        return True
+
+
 def read_hdf5(path: str | Path) -> Record:
     """Read a record of layout ``ambid.record/1``, bit for bit as written; ``file`` and ``sha256`` in the provenance are
     of this file where the record had none.

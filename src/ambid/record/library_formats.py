@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from ambid.errors import RecordError
-from ambid.record.frames import imported, label_of
+from ambid.record.frames import imported
 from ambid.record.record import Record
 from ambid.record.sampling import GapPolicy
-from ambid.record.streams import PIECE, Stream, chosen_group, is_time, library, record_of
+from ambid.record.streams import PIECE, Stream, chosen_group, library, record_of
+from ambid.record.words import is_time, label_of
 
 _TDMS_UNITS = ("unit_string", "NI_UnitDescription", "unit", "Unit", "units", "Units")
 _FIELD_UNITS = (b"unit", b"units")  # of Parquet and Arrow

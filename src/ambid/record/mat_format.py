@@ -16,11 +16,13 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
+from ambid.record.clock import TIME_NAMES, clock_of, seconds, unit_words
 from ambid.record.hdf5_format import hdf5_of
-from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, structures
+from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, scalars, structures
 from ambid.record.record import Record, file_bytes, sha256_of
-from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, check_gap_policy, refuse_gaps, seconds, uniform_record
+from ambid.record.sampling import GapPolicy, Table, check_gap_policy, refuse_gaps, uniform_record
 from ambid.record.streams import refuse_claim
+from ambid.record.words import is_time
 from ambid.units import UNKNOWN
 
 # bytes of numbers by type
@@ -109,7 +111,8 @@ def _check_matrix(data: bytes, at: int, end: int, order: str, depth: int) -> Non
             raise ValueError(f"{size} bytes for an array of shape {shape}")
 
 
-_EXPRESSION = re.compile(r"(?P<path>[A-Za-z]\w*(?:\.[A-Za-z]\w*)*)\s*(?:\(\s*:\s*,\s*(?P<column>\d+)\s*\))?")
+_STEP = r"[A-Za-z]\w*(?:[({]\d+[)}])*"
+_EXPRESSION = re.compile(rf"(?P<path>{_STEP}(?:\.{_STEP})*)\s*(?:\(\s*:\s*,\s*(?P<column>\d+)\s*\))?")
 
 
 def read_mat(
@@ -126,44 +129,86 @@ def read_mat(
     path = Path(path)
     check_gap_policy(gaps)
     data = file_bytes(path)
-    content = _content(path, data)
+    return read_content(
+        _content(path, data), path, sha256_of(data), "mat", variables=variables, rate_hz=rate_hz, gaps=gaps,
+        layout=layout or {},
+    )  # fmt: skip
+
+
+def read_content(
+    content: Mapping[str, Any], path: Path, digest: str, kind: str, *, variables: Mapping[str, tuple[str, str]] | None,
+    rate_hz: float | None, gaps: GapPolicy, layout: Mapping[str, str],
+) -> Record:  # fmt: skip
+    """Make a record of variables: structs are mappings, arrays of them and cells are lists."""
     listed = [
         x for name, (x, _) in (variables or {}).items() if name != "time" and (x != name or _is_vector(content.get(x)))
     ]
-    if not listed:
+    groups: Mapping[str, Any] = {}
+    if not listed or not any(is_time(x) for x in (*content, *(variables or {}))):
         refuse_foreign(content, path)
         groups = structures(content, path)
-        if groups:
-            return read_structures(path, sha256_of(data), groups, layout or {}, rate_hz, gaps)
-    if layout:
+    if groups and not listed:
+        return read_structures(path, digest, groups, layout, rate_hz, gaps, kind, scalars(content))
+    if set(layout) - {"time", "time_unit"}:
         why = f"the rig names the variable {listed[0]}" if listed else "it has no structure with signals"
         raise RecordError(f"record {path}: a layout is for structures; {why}. Omit the layout")
     mapping = dict(variables) if variables is not None else _every_vector(content, path)
-    if "time" not in mapping:
-        clock = next((name for name in TIME_NAMES if name in content), None)
-        mapping |= {"time": (clock, "s")} if clock and rate_hz is None else {}
     columns = {name: _vector(content, expression, path) for name, (expression, _) in mapping.items()}
+    told: dict[str, object] = {}
+    if "time" not in mapping:
+        columns, mapping, told, rate_hz = _with_time(content, columns, mapping, groups, path, layout, rate_hz)
     values = _side_by_side(columns, mapping, path)
     names = tuple(columns)
     time = names.index("time") if "time" in names else None
     if time is not None:
         variable, unit = mapping["time"]
-        values[:, time] = seconds(values[:, time], variable, unit, f"record {path}")
+        text = None if unit == UNKNOWN else unit
+        words = unit_words(values[:, time], variable, text) if rate_hz is None else ""
+        told |= {"time": ", ".join(str(x) for x in (told.get("time"), words) if x)} if words else {}
+        values[:, time] = seconds(values[:, time], variable, text, f"record {path}", layout, rate_hz)
     table = Table(
         where=str(path), names=names, values=values, first_row=1, time=time,
         unit_texts=tuple(None if unit == UNKNOWN else unit for _, unit in mapping.values()),
-        provenance={"file": path.name, "sha256": sha256_of(data)},
-        settings={"format": "mat", "variables": {name: expression for name, (expression, _) in mapping.items()}},
+        provenance={"file": path.name, "sha256": digest},
+        settings={"format": kind, "variables": {name: expression for name, (expression, _) in mapping.items()}, **told},
     )  # fmt: skip
     if gaps == "error":
         refuse_gaps(table)
     return uniform_record(table, rate_hz, gaps)
 
 
+def _with_time(
+    content: Mapping[str, Any], columns: dict[str, Array], mapping: dict[str, tuple[str, str]],
+    groups: Mapping[str, Any], path: Path, layout: Mapping[str, str], rate_hz: float | None,
+) -> tuple[dict[str, Array], dict[str, tuple[str, str]], dict[str, object], float | None]:  # fmt: skip
+    """Find the time of columns: among them, in a vector beside them, in the structure, or in a rate beside them."""
+    if rate_hz is not None:
+        columns = {k: x for k, x in columns.items() if k.lower() not in TIME_NAMES}
+        return columns, {k: mapping[k] for k in columns}, {}, rate_hz
+    size = max(x.size for x in columns.values())
+    used = {x for x, _ in mapping.values()}
+    vectors = {k: _vector(content, k, path) for k, x in content.items() if k not in used and _is_vector(x)}
+    every = {**columns, **{k: x for k, x in vectors.items() if x.size == size and k not in columns}}
+    beside = scalars(content)
+    units = [None if k not in mapping or mapping[k][1] == UNKNOWN else mapping[k][1] for k in every]
+    clock = clock_of(list(every), units, list(every.values()), where=f"record {path}", beside=beside, layout=layout)
+    told: dict[str, object] = {"time": clock.why} if clock.why else {}
+    if clock.column is not None:
+        name = list(every)[clock.column]
+        unit = mapping.get(name, (name, UNKNOWN))[1]
+        rest = {k: x for k, x in columns.items() if k != name}
+        source = mapping.get(name, (name, unit))[0]
+        return {**rest, "time": every[name]}, {**{k: mapping[k] for k in rest}, "time": (source, unit)}, told, rate_hz
+    stamps = next((s.time for x in groups.values() for s in x if s.time is not None and s.time.size == size), None)
+    if stamps is not None and clock.rate_hz is None:
+        return {**columns, "time": stamps}, {**mapping, "time": ("time", "s")}, told, rate_hz
+    return columns, mapping, told, clock.rate_hz
+
+
 def _content(path: Path, data: bytes) -> dict[str, Any]:
     """Return the variables of the file, structs as nested dicts."""
     if b"\x89HDF\r\n\x1a\n" in (data[:8], data[512:520]):
-        return _content_v73(path)
+        return content_of_hdf5(path, matlab=True)
     from scipy.io import loadmat
 
     try:
@@ -198,7 +243,8 @@ def _fields(value: Any) -> Any:
     return value
 
 
-def _content_v73(path: Path) -> dict[str, Any]:
+def content_of_hdf5(path: Path, *, matlab: bool) -> dict[str, Any]:
+    """Return the variables of a file of version 7.3, or of the datasets and groups of any HDF5 file."""
     import h5py
 
     size = path.stat().st_size
@@ -217,6 +263,8 @@ def _content_v73(path: Path) -> dict[str, Any]:
                 isinstance(x, list) and "MATLAB_class" not in node[k].attrs and not isinstance(node[k], h5py.Group)
                 for k, x in fields.items()
             ]
+            units = {n: text_of(x, k) for n, x in node.items() for k in ("units", "unit") if k in x.attrs}
+            fields |= {"units": units} if units and "units" not in fields else {}
             if arrays and all(arrays) and len({len(x) for x in fields.values()}) == 1:  # an array of structs
                 return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
             return fields
@@ -229,7 +277,7 @@ def _content_v73(path: Path) -> dict[str, Any]:
         if kind == "char":
             return values.astype("<u2").tobytes().decode("utf-16-le", "replace") if min(values.shape) < 2 else ""
         # MATLAB stores column-major: what HDF5 shows is the transpose of the variable.
-        return values.T if values.ndim >= 2 else values
+        return values.T if matlab and values.ndim >= 2 else values.reshape(1, 1) if values.ndim == 0 else values
 
     try:
         with hdf5_of(path) as file:
@@ -245,14 +293,14 @@ def _content_v73(path: Path) -> dict[str, Any]:
         ArithmeticError,
         MemoryError,
     ) as failure:
-        raise RecordError(
-            f"record {path} is not a valid MATLAB 7.3 file ({failure}). Save it again from MATLAB"
-        ) from None
+        raise RecordError(f"record {path} is not a valid MATLAB 7.3 or HDF5 file ({failure}). Save it again") from None
 
 
 def _every_vector(content: Mapping[str, Any], path: Path) -> dict[str, tuple[str, str]]:
     """Map every numeric vector of the file, of unknown unit."""
-    vectors = {name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and name not in TIME_NAMES}
+    vectors = {
+        name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and len(value.reshape(-1)) > 1
+    }
     if not vectors:
         shapes = ", ".join(f"{name} {_shape(value)}" for name, value in list(content.items())[:8]) or "nothing"
         raise RecordError(
@@ -271,16 +319,23 @@ def _vector(content: Mapping[str, Any], expression: str, path: Path) -> Array:
     """Look a variable up and return it as a column, shape (n_samples,)."""
     match = _EXPRESSION.fullmatch(expression.strip())
     if match is None:
-        raise RecordError(f"{expression!r} is not a variable of {path}; write it as y, data.y or y(:,2)")
+        raise RecordError(f"{expression!r} is not a variable of {path}; write it as y, data.y, rec.Y(2).Data or y(:,2)")
     value: Any = content
-    for depth, name in enumerate(match["path"].split(".")):
+    inside = ""
+    for name in re.findall(r"[A-Za-z]\w*|\d+", match["path"]):
+        if name.isdigit():
+            parts = value if isinstance(value, list) else [value]
+            if not 1 <= int(name) <= len(parts):
+                raise RecordError(f"record {path}: {inside} has {len(parts)} parts, not {name}. Correct the variable")
+            value, inside = parts[int(name) - 1], f"{inside}({name})"
+            continue
         if not isinstance(value, Mapping) or name not in value:
-            inside = ".".join(match["path"].split(".")[:depth]) or "the file"
             names = ", ".join(list(value)[:12]) if isinstance(value, Mapping) else "no fields"
             raise RecordError(
-                f"record {path}: {inside} has no {name!r}; it has {names or 'nothing'}. Correct the variable"
+                f"record {path}: {inside or 'the file'} has no {name!r}; it has {names or 'nothing'}. Correct the "
+                "variable"
             )
-        value = value[name]
+        value, inside = value[name], f"{inside}.{name}" if inside else name
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise RecordError(
             f"record {path}: variable {expression!r} is {_shape(value)}; it must be real numbers. Correct it"

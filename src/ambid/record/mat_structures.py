@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,16 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
-from ambid.record.frames import label_of
+from ambid.record.clock import TIME_NAMES, clock_of, seconds, unit_words
 from ambid.record.record import Record
-from ambid.record.sampling import TIME_NAMES, GapPolicy
+from ambid.record.sampling import MIN_SAMPLES, GapPolicy
 from ambid.record.streams import Stream, chosen_group, record_of
+from ambid.record.words import is_time, label_of, unit_or_none
 from ambid.settings.caller import setting
 from ambid.units import parse_unit
 
 _LONE = "signals"  # group of the structures that hold one signal each
 _VECTORS = "vectors"
-_CLOCKS = ("tout", *TIME_NAMES)
 _UNITS = ("units", "Units", "unit", "Unit")
 _REMEDIES = {
     "timeseries": "S = struct('Time', {0}.Time, 'Data', {0}.Data, 'Name', {0}.Name, 'units', {0}.DataInfo.Units)",
@@ -75,23 +75,94 @@ def structures(content: Mapping[str, Any], path: Path) -> dict[str, list[_Signal
     """Return the signals of the file by group: by variable, those of variables with one signal each together."""
     groups: dict[str, list[_Signal]] = {}
     for name, node in content.items():
-        signals = list(_signals(node, name, path))
+        signals = list(_lines(node)) if name.startswith("hgS_") else list(_signals(node, name, path))
         if signals:
             groups.setdefault(_LONE if len(signals) == 1 else name, []).extend(signals)
-    loose = {k: v for k, v in content.items() if _vector(v) is not None and k not in _CLOCKS} if groups else {}
+    vectors = {k: v for k, x in content.items() if (v := _vector(x)) is not None}
+    if not groups and len(vectors) < 2:
+        signals = list(_matrix(content))
+        return {_VECTORS: signals} if signals else {}
+    loose = {k: v for k, v in vectors.items() if not is_time(k)} if groups else {}
     if loose:
-        time = next((_vector(content[k]) for k in _CLOCKS if k in content), None)
+        time = next((v for k, v in vectors.items() if is_time(k)), None)
         groups[_VECTORS] = [_Signal(name=k, values=v, units={}, time=time) for k, v in loose.items()]
     return groups
 
 
+def scalars(node: Any) -> dict[str, tuple[float, str | None]]:
+    """Return the numbers that stand beside the data, by name."""
+    found: dict[str, tuple[float, str | None]] = {}
+    for key, x in node.items() if isinstance(node, Mapping) else ():
+        if isinstance(x, np.ndarray) and x.size == 1 and x.dtype.kind in "fiu":
+            found[key] = (float(x.reshape(-1)[0]), None)
+        elif isinstance(x, Mapping):
+            found |= scalars(x)
+    return found
+
+
+def _matrix(node: Mapping[str, Any]) -> Iterator[_Signal]:
+    """Yield the columns of the one matrix of a struct: named by texts beside it, or by number."""
+    matrices = {k: x for k, x in node.items() if isinstance(x, np.ndarray) and x.ndim == 2 and x.dtype.kind in "fiu"}
+    matrices = {k: x if x.shape[0] >= x.shape[1] else x.T for k, x in matrices.items() if min(x.shape) > 1}
+    large = {k: x for k, x in matrices.items() if x.shape[0] >= MIN_SAMPLES and x.shape[0] > x.shape[1]}
+    if len(large) != 1:
+        return
+    key, matrix = next(iter(large.items()))
+    n = matrix.shape[1]
+    texts = [x for x in map(_texts, node.values()) if len(x) == n]
+    units = next((x for x in texts if all(unit_or_none(t) for t in x if t) and any(x)), None)
+    names = next((x for x in texts if x is not units and len(set(x)) == n), None)
+    labels = [label_of(x) for x in names] if names else [(f"{key}({j + 1})", None) for j in range(n)]
+    for j, (name, inside) in enumerate(labels):
+        unit = inside or ("" if units is None else units[j])
+        yield _Signal(name=name or f"column {j + 1}", values=matrix[:, j], units={"units": unit})
+
+
+def _texts(value: Any) -> list[str]:
+    """Return the texts of a cell array, or of rows of letters."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "US":
+        value = value.reshape(-1).tolist()
+    return (
+        [_text(x) for x in value] if isinstance(value, list) and all(isinstance(x, str | list) for x in value) else []
+    )
+
+
+def _lines(node: Any) -> Iterator[_Signal]:
+    """Yield the lines of a MATLAB figure."""
+    for x in node if isinstance(node, list) else [node]:
+        if not isinstance(x, Mapping):
+            continue
+        own = x.get("properties")
+        along, values = (_vector(_at(own, k)) for k in ("XData", "YData"))
+        if along is not None and values is not None and along.size == values.size:
+            label, unit = label_of(_text(_at(own, "DisplayName")) or _text(_at(own, "Tag")))
+            yield _Signal(name=label or "line", values=values, units={"label": unit or ""}, time=along)
+        yield from _lines(x.get("children"))
+
+
+def _dspace(fields: Mapping[str, Any], path: Path) -> Iterator[_Signal]:
+    """Yield the signals of a measurement of dSPACE: X(k) are axes, Y(k) lie over X(Y(k).XIndex)."""
+    axes, signals = (x if isinstance(x, list) else [x] for x in (fields["x"], fields["y"]))
+    for k, y in enumerate(signals, 1):
+        index = _at(y, "XIndex")
+        at = int(index.reshape(-1)[0]) - 1 if isinstance(index, np.ndarray) and index.size else 0
+        x = axes[min(max(at, 0), len(axes) - 1)]
+        label, inside = label_of(_text(y.get("Name")) or f"Y({k})")
+        yield from _columns(
+            y["Data"], label, path, _units(y) or {"Name": inside or ""}, time=_vector(_at(x, "Data")),
+            time_unit=_text(_at(x, "Unit")) or "s",
+        )  # fmt: skip
+
+
 def read_structures(
     path: Path, digest: str, groups: Mapping[str, list[_Signal]], layout: Mapping[str, str], rate_hz: float | None,
-    gaps: GapPolicy,
+    gaps: GapPolicy, kind: str, beside: Mapping[str, tuple[float, str | None]],
 ) -> Record:  # fmt: skip
     """Make a record of the signals of one group."""
     group = chosen_group(path, {k: [s.name for s in v] for k, v in groups.items()}, layout.get("group"))
-    every = groups[group]
+    every, told = groups[group], dict[str, object]()
+    if all(s.time is None and s.step is None for s in every):
+        every, told, rate_hz = _timed(every, path, layout, rate_hz, beside)
     twice = next((s.name for k, s in enumerate(every) if s.name in [x.name for x in every[:k]]), None)
     if twice is not None:
         raise RecordError(f"record {path}: {group} has two signals {twice!r}; names must differ. Rename one")
@@ -110,7 +181,26 @@ def read_structures(
         time = np.asarray(clocks[0].time, dtype=np.float64)
         unit = frozenset({clocks[0].time_unit})
         streams.append(Stream(name="time", size=time.size, pieces=lambda: (time,), time=True, units=unit))
-    return record_of(path, digest, streams, {"format": "mat", "group": group}, layout, rate_hz, gaps)
+    return record_of(path, digest, streams, {"format": kind, "group": group, **told}, layout, rate_hz, gaps)
+
+
+def _timed(
+    every: list[_Signal], path: Path, layout: Mapping[str, str], rate_hz: float | None,
+    beside: Mapping[str, tuple[float, str | None]],
+) -> tuple[list[_Signal], dict[str, object], float | None]:  # fmt: skip
+    """Find the time of signals among them, or a rate beside them."""
+    every = [x for x in every if x.values.size == max(y.values.size for y in every)]
+    names, units = [x.name for x in every], [next(filter(None, x.units.values()), None) for x in every]
+    columns = [x.values for x in every]
+    clock = clock_of(names, units, columns, where=f"record {path}", rate_hz=rate_hz, beside=beside, layout=layout)
+    told: dict[str, object] = {"time": clock.why} if clock.why else {}
+    if clock.column is None:
+        return every, told, rate_hz if clock.rate_hz is None else clock.rate_hz
+    own, name, unit = columns[clock.column], names[clock.column], units[clock.column]
+    words = unit_words(own, name, unit) if rate_hz is None else ""
+    time = seconds(np.asarray(own, dtype=np.float64), name, unit, f"record {path}", layout, rate_hz)
+    told = {"time": ", ".join(filter(None, [clock.why, words]))} if clock.why or words else {}
+    return [replace(x, time=time) for j, x in enumerate(every) if j != clock.column], told, rate_hz
 
 
 def _span(signal: _Signal) -> str:
@@ -153,7 +243,9 @@ def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
     time, signals(k).values, .label          Simulink, "Structure with time"
     Time, Data, Name, units                  a timeseries as struct, alone, in arrays, fields or Elements{k}.Values
     x_values, y_values, function_record      Simcenter (LMS) Testlab
-    time, u, i, …, units.u                   a struct of columns
+    X.Data, Y(k).Data, .Name, .Unit          dSPACE
+    time, u, i, …, units.u                   a struct of columns, with or without time
+    data, names                              a struct of a matrix
     """
     if isinstance(node, list):
         for k, x in enumerate(node, 1):
@@ -161,8 +253,12 @@ def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
     if not isinstance(node, Mapping):
         return
     fields = {key.lower(): x for key, x in node.items()}
-    time = next((v for key in TIME_NAMES if (v := _vector(fields.get(key))) is not None), None)
-    if "signals" in fields and "time" in fields:
+    time = next(
+        (v for key in (*TIME_NAMES, *filter(is_time, fields)) if (v := _vector(fields.get(key))) is not None), None
+    )
+    if all(_at(x[0] if isinstance(x, list) and x else x, "Data") is not None for x in map(fields.get, "xy")):
+        yield from _dspace(fields, path)
+    elif "signals" in fields and "time" in fields:
         parts = fields["signals"] if isinstance(fields["signals"], list) else [fields["signals"]]
         for k, part in enumerate(parts, 1):
             if isinstance(part, Mapping) and "values" in part:
@@ -175,17 +271,27 @@ def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
         yield from _columns(fields["data"], called, path, _units(node), time=time, time_unit=unit)
     elif "x_values" in fields and "y_values" in fields:
         yield from _testlab(fields, name, path)
-    elif time is not None:
+    elif time is not None and any(is_time(k) for k in fields):
         unit_text = fields.get("units")
+        over = next((u for k in node if is_time(k) and (u := _beside(unit_text, k)["units"])), "s")
         for key, x in node.items():
-            vector = None if key.lower() in TIME_NAMES else _vector(x)
+            vector = None if is_time(key) else _vector(x)
             if vector is not None and vector.size == time.size:
-                by_name = {"units": _text(unit_text.get(key)) if isinstance(unit_text, Mapping) else ""}
-                yield _Signal(name=key, values=vector, units=by_name, time=time)
+                yield _Signal(name=key, values=vector, units=_beside(unit_text, key), time=time, time_unit=over)
+    elif len(vectors := {k: v for k, x in node.items() if (v := _vector(x, MIN_SAMPLES)) is not None}) > 1:
+        for key, vector in vectors.items():
+            yield _Signal(name=key, values=vector, units=_beside(fields.get("units"), key))
+    elif signals := list(_matrix(node)):
+        yield from signals
     else:
         for key, x in node.items():
             called = _text(fields.get("name")) if key.lower() == "values" else ""
             yield from _signals(x, called or (name if key.lower() in ("values", "elements") else key), path)
+
+
+def _beside(units: Any, key: str) -> dict[str, str]:
+    """Return the unit that a struct of units has for a field."""
+    return {"units": _text(units.get(key)) if isinstance(units, Mapping) else ""}
 
 
 def _testlab(fields: Mapping[str, Any], name: str, path: Path) -> Iterator[_Signal]:

@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import RecordError, UnitError, counted
+from ambid.errors import RecordError, counted
 from ambid.record.record import Channel, Record, Step, check_rate
+from ambid.record.words import unit_or_none
 from ambid.settings.caller import setting
-from ambid.units import UNKNOWN, nearest_unit, parse_unit
+from ambid.units import UNKNOWN
 
 GapPolicy = Literal["error", "interpolate", "cut"]
 GAP_POLICIES: tuple[GapPolicy, ...] = ("error", "interpolate", "cut")
 MIN_SAMPLES = 8
 JITTER = 0.01  # of a sampling period
-TIME_NAMES = ("time", "t")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,29 +128,10 @@ def column_channel(name: str, unit_text: str | None, raw: Array) -> Channel:
     """Make a channel in SI from raw values (n_samples,) in the file's unit; of a missing or unknown one they stay, in
     ``"?"``.
     """
-    try:
-        unit = parse_unit(unit_text or "")
-    except UnitError:
+    unit = unit_or_none(unit_text)
+    if unit is None:
         return Channel(name=name, unit=UNKNOWN, values=raw, source_unit=unit_text or UNKNOWN)
     return Channel(name=name, unit=unit.si, values=unit.to_si(raw), source_unit=unit.symbol)
-
-
-def seconds(time: Array, name: str, text: str | None, where: str) -> Array:
-    """Return time stamps in s; `text`: their unit, as the column gives it."""
-    if text is None:
-        raise RecordError(f"{where}: column {name!r} has no unit. Write '{name} [s]' (or ms, us)")
-    try:
-        unit = parse_unit(text)
-    except UnitError:
-        raise RecordError(
-            f"{where}: column {name!r} is in [{text}], which is not a known unit (nearest: {nearest_unit(text)})."
-            " Time must be in [s], [ms] or [us]"
-        ) from None
-    if unit.si != "s":
-        raise RecordError(
-            f"{where}: column {name!r} is in [{text}]; time must be in [s], [ms] or [us]. Correct the unit"
-        )
-    return unit.to_si(time)
 
 
 def refuse_gaps(table: Table) -> None:
@@ -205,7 +186,8 @@ def _check_rate(table: Table, rate_hz: float | None) -> None:
     if table.time is None and rate_hz is None:
         raise RecordError(
             f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
-            f" Add the column, or give {setting('rate_hz')}"
+            f" Add the column, name the one that is time with {setting('layout', 'time=NAME')}, or give "
+            f"{setting('rate_hz')}"
         )
 
 

@@ -14,19 +14,17 @@ from types import MappingProxyType
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import RecordError, UnitError, choices
+from ambid.errors import RecordError, choices
+from ambid.record.clock import seconds
 from ambid.record.frames import numbers
 from ambid.record.record import Channel, Record, Step, readable
-from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, agreed_rate, refuse_gaps, sample_uniformly, seconds
+from ambid.record.sampling import GapPolicy, Table, agreed_rate, refuse_gaps, sample_uniformly
+from ambid.record.words import symbol, unit_or_none
 from ambid.settings.caller import setting
-from ambid.units import UNKNOWN, Unit, parse_unit
+from ambid.units import UNKNOWN, Unit
 
 PIECE = 1 << 18  # samples that are read at once
 _MOST_PACKED = 1032  # values a byte of a file can stand for: the most that deflate packs
-
-_WORDS = {"volts": "V", "volt": "V", "amps": "A", "amperes": "A", "ampere": "A", "meters": "m", "seconds": "s",
-          "milliseconds": "ms", "microseconds": "us", "newtons": "N", "hertz": "Hz", "ohms": "ohm", "degrees": "deg",
-          "radians": "rad"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -177,25 +175,19 @@ def _wanted(path: Path, streams: Sequence[Stream], layout: Mapping[str, str]) ->
     return wanted
 
 
-def is_time(name: str) -> bool:
-    """Whether a column called so is time."""
-    return name.lower() in TIME_NAMES
-
-
 def _unit_of(stream: Stream, path: Path) -> tuple[Unit | None, str]:
     """Return the unit, None where it is missing or not known, and how the file writes it."""
-    texts = {_WORDS.get(text.lower(), text) for text in stream.units}
+    texts = {symbol(text) for text in stream.units}
     if len(texts) > 1:
         raise RecordError(
             f"record {path}: channel {stream.name!r} is in {' and in '.join(f'[{x}]' for x in sorted(texts))}; it has "
             "one unit. Correct its properties, or export it again"
         )
     text = next(iter(texts), UNKNOWN)
-    try:
-        unit = parse_unit(text)
-    except UnitError:
-        return None, text
-    return (None, text) if text == "g" else (unit, unit.symbol)  # of instruments: gravity rather than gram
+    unit = unit_or_none(text)
+    return (
+        (None, text) if unit is None or text == "g" else (unit, unit.symbol)
+    )  # of instruments: gravity rather than gram
 
 
 def _fill(out: Array, stream: Stream, unit: Unit | None, path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
@@ -16,6 +15,7 @@ from ambid.physics.magnet import CoEnergy
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record
+from ambid.record.words import is_set_point, quantities
 from ambid.rig.load import rig_from_text
 from ambid.rig.rig import (
     OPTIONAL_ROLES,
@@ -28,7 +28,7 @@ from ambid.rig.rig import (
     toml_lines,
     toml_text,
 )
-from ambid.rig.roles import NAMES, SET_POINT, Candidate, at_rest, rank_roles
+from ambid.rig.roles import Candidate, at_rest, rank_roles
 from ambid.rig.rotor import RigModes
 from ambid.settings.caller import command, setting
 from ambid.units import UNKNOWN, parse_unit
@@ -153,9 +153,7 @@ def _turning(record: Record) -> dict[str, Channel]:
         fits = [
             c
             for c in record.channels
-            if c.unit == OPTIONAL_ROLES[role]
-            and re.search(NAMES[role], c.name.lower())
-            and not re.search(SET_POINT, c.name.lower())
+            if c.unit == OPTIONAL_ROLES[role] and role in quantities(c.name) and not is_set_point(c.name)
         ]
         channels |= {role: fits[0]} if fits else {}
     return channels

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,18 +15,11 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import AmbidError
 from ambid.record.record import Channel, Record
+from ambid.record.words import is_set_point, quantities, unit_or_none, unit_within
 from ambid.signals.spectra import cross_spectra, snr
 from ambid.units import UNKNOWN
 
 ROLES = {"voltage": "V", "current": "A", "position": "m"}
-NAMES = {
-    "voltage": r"volt|^u|^v\b|^v_|duty|pwm|command|input|drive",
-    "current": r"curr|^i\b|^i_|amp",
-    "position": r"pos|disp|gap|^x|^y|^z|eddy|hall|sensor|output",
-    "speed": r"speed|omega|rpm|rotat|spin",
-    "angle": r"angle|phi|theta|encoder",
-}
-SET_POINT = r"ref|set|target|desired|goal"
 _UNNAMED = 0.3  # what unit and name say of a column without either
 _CLOSE = 0.15  # scores that differ by less are left to the user
 _LOOKED = 16384  # samples
@@ -88,7 +80,7 @@ def rank_roles(record: Record) -> Mapping[str, Sequence[Candidate]]:
 
 def close(ranked: Sequence[Candidate]) -> bool:
     """Whether the second is nearly as likely as the first."""
-    return len(ranked) > 1 and ranked[0].score - ranked[1].score < _CLOSE
+    return len(ranked) > 1 and ranked[0].score - ranked[1].score < _CLOSE * ranked[0].named
 
 
 def at_rest(ranked: Mapping[str, Sequence[Candidate]]) -> bool:
@@ -99,14 +91,20 @@ def at_rest(ranked: Mapping[str, Sequence[Candidate]]) -> bool:
 
 def _name(c: Channel, role: str) -> float:
     """Rate a column by unit and name; 0: not of this role."""
-    if re.search(SET_POINT, c.name.lower()):
+    if is_set_point(c.name):
         return 0.0
-    named = re.search(NAMES[role], c.name.lower()) is not None
-    if c.unit == ROLES[role]:
-        return 1.0 if named else 0.8
-    if c.unit not in ("1", UNKNOWN, *(["V"] if named else [])):
+    names, unit = quantities(c.name), unit_of(c)
+    if unit == ROLES[role]:
+        return 1.0 if role in names else 0.8
+    if unit not in ("1", UNKNOWN, *(["V"] if role in names else [])):
         return 0.0
-    return 0.6 if named else 0.0 if any(re.search(other, c.name.lower()) for other in NAMES.values()) else _UNNAMED
+    return 0.6 if role in names else 0.0 if names else _UNNAMED
+
+
+def unit_of(c: Channel) -> str:
+    """Return the SI unit of a column, of one without by what its name ends in, such as ``pos_um``."""
+    within = None if c.unit != UNKNOWN or c.source_unit != UNKNOWN else unit_or_none(unit_within(c.name))
+    return c.unit if within is None else within.si
 
 
 def _named(c: Channel, role: str, record: Record) -> Candidate:
@@ -232,8 +230,9 @@ def _weak(c: Candidate) -> list[str]:
 
 
 def _unit_words(c: Candidate) -> str:
-    words = f"its unit [{c.channel.source_unit}]"
-    if c.channel.unit == ROLES[c.role]:
+    within = unit_within(c.channel.name) if c.channel.unit != unit_of(c.channel) else None
+    words = f"its unit [{within or c.channel.source_unit}]"
+    if unit_of(c.channel) == ROLES[c.role]:
         return f"{words} and name fit" if c.named == 1.0 else f"{words} fits"
     return f"{words} instead of [{ROLES[c.role]}]" + ("" if c.named == _UNNAMED else ", but the name fits")
 

@@ -15,8 +15,8 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.errors import RecordError, UnitError, choices
 from ambid.record.csv_dialect import decoded, recognised
-from ambid.record.frames import label_of
 from ambid.record.record import check_rate, file_bytes, gunzipped, sha256_of
+from ambid.record.words import label_of
 from ambid.settings.caller import setting
 from ambid.signals.response import FrequencyResponse, Hold, ratio
 from ambid.units import UNKNOWN, Unit, parse_unit

@@ -1,0 +1,161 @@
+"""Which column is time, and in what unit: by its name, its unit, and how it rises; else a rate beside the data."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import RecordError, choices
+from ambid.record.words import is_time, quantities, rate_of, symbol, unit_or_none, unit_within
+from ambid.settings.caller import setting
+from ambid.units import nearest_unit
+
+TIME_NAMES = ("time", "t")
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SLOW, _USUAL, _FAST = 50.0, 500.0, 2e6  # Hz: below the first no bearing is sampled, above the second all are
+_EVEN = 0.05  # part of an interval by which those of a column differ that is time though nothing says so
+_LOOKED = 4096  # rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clock:
+    """What is time in a table."""
+
+    column: int | None = None  # None: there is none
+    rate_hz: float | None = None  # beside the data
+    why: str = ""  # nothing where the column is called time or t
+
+
+def clock_of(
+    names: Sequence[str], units: Sequence[str | None], columns: Sequence[Array], *, where: str,
+    rate_hz: float | None = None, beside: Mapping[str, tuple[float, str | None]] | None = None,
+    layout: Mapping[str, str] | None = None,
+) -> Clock:  # fmt: skip
+    """Find time; `beside`: numbers beside the data with their units, `layout`: whose word ``time`` names the column."""
+    word = (layout or {}).get("time")
+    if word is not None and word not in names:
+        raise RecordError(f"{where} has no column {word!r}; it has {choices(word, names)} Correct layout time")
+    at = None if word is None else list(names).index(word)
+    if at is None:
+        at = next((j for j, name in enumerate(names) if name.lower() in TIME_NAMES), None)
+        if at is not None:
+            return Clock(column=at)
+    why = "the layout says so"
+    rising = [j for j, x in enumerate(columns) if rises(x)]
+    kinds = [unit_or_none(u if u is not None else unit_within(n)) for n, u in zip(names, units, strict=True)]
+    second = [unit is not None and unit.si == "s" for unit in kinds]
+    unlike = [unit is not None and unit.si != "s" for unit in kinds]
+    for fits, reason in (
+        ([is_time(n) and not bad for n, bad in zip(names, unlike, strict=True)], "its name says so, and it rises"),
+        (second, "it is in a unit of time, and rises"),
+    ):
+        if at is None:
+            at, why = next((j for j in rising if fits[j]), None), reason
+    told = [(key, r) for key, (x, unit) in (beside or {}).items() if (r := rate_of(key, x, unit)) is not None]
+    if at is None and rate_hz is None and told:
+        if max(r for _, r in told) > 1.01 * min(r for _, r in told):
+            listed = ", ".join(f"{key} says {r:g} Hz" for key, r in told)
+            raise RecordError(f"{where}: {listed}. Say which is right: {setting('rate_hz')}")
+        return Clock(rate_hz=told[0][1], why=f"{told[0][0]} beside the data: {told[0][1]:g} Hz")
+    if at is None and rate_hz is None:
+        nameless = [j for j in rising if units[j] is None and even(columns[j]) and not _counts(columns[j])]
+        nameless = [j for j in nameless if names[j].lower() == "x" or not quantities(names[j])]
+        if len(nameless) == 1:
+            at, why = nameless[0], "it alone rises evenly"
+    return Clock(column=at, why="" if at is None else f"{names[at]!r}, because {why}")
+
+
+def seconds(
+    time: Array, name: str, text: str | None, where: str, layout: Mapping[str, str] | None = None,
+    rate_hz: float | None = None,
+) -> Array:  # fmt: skip
+    """Return time stamps in s; `text`: their unit, as the column gives it; else name, steps or rate tell it."""
+    text = (layout or {}).get("time_unit", text)
+    text = unit_within(name) if text is None else text
+    if text is None and rate_hz is not None and _counts(time):
+        return time / rate_hz
+    text = _unit_of_steps(time, name, where, rate_hz) if text is None else symbol(text)
+    unit = unit_or_none(text)
+    if unit is None:
+        raise RecordError(
+            f"{where}: column {name!r} is in [{text}], which is not a known unit (nearest: {nearest_unit(text)})."
+            " Time must be in [s], [ms] or [us]"
+        )
+    if unit.si != "s":
+        raise RecordError(
+            f"{where}: column {name!r} is in [{text}]; time must be in [s], [ms] or [us]. Correct the unit"
+        )
+    return unit.to_si(time)
+
+
+def dates(texts: Sequence[str]) -> Array | None:
+    """Return dates or times of day in s from the first on; None where the texts are none."""
+    day = "1970-01-01T" if re.fullmatch(r"\d{1,2}:\d\d:\d\d([.,]\d+)?", texts[0]) else ""
+    if not day and not re.match(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:", texts[0]):
+        return None
+    try:
+        stamps = np.array([day + x.replace(" ", "T").replace(",", ".").rstrip("Z") for x in texts], "datetime64[ns]")
+    except ValueError:
+        return None
+    return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def unit_words(time: Array, name: str, text: str | None) -> str:
+    """Say in which unit time is, and why, where the column does not say it."""
+    if text is not None:
+        return ""
+    within = unit_within(name)
+    return f"in [{within}] by its name" if within else f"in [{_plausible(time)[0]}], in which its rate is a usual one"
+
+
+def _unit_of_steps(time: Array, name: str, where: str, rate_hz: float | None) -> str:
+    fits, period = _plausible(time), _period(time)
+    if rate_hz is not None and period > 0:
+        fits = [unit for unit, scale in _UNITS.items() if abs(rate_hz * period * scale - 1) <= _EVEN] or fits
+    if len(fits) == 1 and not _counts(time):
+        return fits[0]
+    listed = " or ".join(f"{unit} ({1 / (period * _UNITS[unit]):g} Hz)" for unit in fits) or "s, ms or us"
+    raise RecordError(
+        f"{where}: column {name!r} has no unit and rises by {period:g} a row; it may be in {listed}"
+        f"{', or count samples' if _counts(time) else ''}. Write '{name} [s]' (or ms, us), or give "
+        f"{setting('layout', 'time_unit=s')} or {setting('rate_hz')}"
+    )
+
+
+def _plausible(time: Array) -> list[str]:
+    """Return the units in which a rate is that of a bearing: the usual ones, and those that cannot be ruled out."""
+    period = _period(time)
+    if not period > 0:
+        return ["s"]  # what is wrong with it is told where rates are checked
+    rates = {unit: 1.0 / (period * scale) for unit, scale in _UNITS.items()}
+    usual = [unit for unit, rate in rates.items() if _USUAL <= rate <= _FAST]
+    slow = [unit for unit, rate in rates.items() if _SLOW < rate < _USUAL]
+    return [*slow, *usual[:1]] if usual else slow
+
+
+def _period(time: Array) -> float:
+    steps = np.diff(time[np.isfinite(time)][:_LOOKED])
+    return float(np.median(steps)) if steps.size else 0.0
+
+
+def _counts(x: Array) -> bool:
+    """Whether a column counts rows."""
+    head = x[:_LOOKED]
+    return bool(_period(head) == 1.0 and np.all(np.mod(head[np.isfinite(head)], 1.0) == 0))
+
+
+def rises(x: Array) -> bool:
+    """Whether a column rises nearly everywhere."""
+    head = x[:_LOOKED]
+    steps = np.diff(head[np.isfinite(head)])
+    return bool(steps.size and np.median(steps) > 0 and np.mean(steps > 0) > 0.98)
+
+
+def even(x: Array) -> bool:
+    """Whether a column rises by equal steps."""
+    steps = np.diff(x[:_LOOKED])
+    return bool(np.all(np.abs(steps - np.median(steps)) <= _EVEN * abs(np.median(steps))))
