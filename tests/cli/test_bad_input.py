@@ -86,7 +86,7 @@ def gap(values):
 RECORDS = {
     "missing unit": (header("current [mA]", "current"), r"column 'current' has no unit.*current \[unit\]"),
     "wrong unit": (header("current [mA]", "current [mV]"), r"'current' is in \[mV\]; the rig needs a current in \[A\]"),
-    "unknown unit": (header("current [mA]", "current [Amps]"), r"'current' is in \[Amps\], an unknown unit"),
+    "unknown unit": (header("current [mA]", "current [Ams]"), r"'current' is in \[Ams\], an unknown unit"),
     "position in volt": (header("position [um]", "position [V]"), r"'position' is in \[V\].*gain or table"),
     "swapped headers": (
         header("voltage [V],current [mA]", "voltage [mA],current [V]"),
@@ -100,14 +100,17 @@ RECORDS = {
     "short row": (cell(99, 3, "1.0,2.0"), r"row 102.*5"),
     "two rows": (first_rows(2), r"2 rows.*at least 8"),
     "header only": (first_rows(0), r"row|rows"),
-    "no header": (lambda t: "\n".join(t.splitlines()[2:]) + "\n", r"row 1.*header"),
+    "no header": (lambda t: "\n".join(t.splitlines()[2:]) + "\n", r"no column 'voltage'.*column 2, column 3"),
     "empty": (lambda t: "", r"is empty \(0 bytes\)"),
     "comments only": (lambda t: "# nothing\n", r"header"),
     "duplicate column": (header("position [um]", "current [A]"), r"'current'.*twice"),
     "missing column": (header("position [um]", "height [um]"), r"no column 'position'.*channels\.position"),
-    "no time, no rate": (header("time [ms]", "clock [ms]"), r"no column 'time \[s\]'.*--rate"),
+    "no time, no rate": (header("time [ms]", "load [N]"), r"no column 'time \[s\]'.*--rate"),
     "time in metres": (header("time [ms]", "time [m]"), r"'time' is in \[m\]; time must be in \[s\]"),
-    "time without unit": (header("time [ms]", "time"), r"'time' has no unit"),
+    "time in s or ms": (
+        changed(lambda v: v * [0.2, 1, 1, 1], HEADER.replace(" [ms]", "")),
+        r"'time' has no unit.*100 Hz",
+    ),
     "irregular time": (changed(irregular), r"row \d+"),
     "time runs backwards": (changed(backwards), r"row \d+"),
     "time stands still": (changed(twice), r"row \d+"),
@@ -147,13 +150,13 @@ FILES = {
     "no gzip": ("record.csv.gz", str.encode, r"not a valid gzip"),
     "gzip without its name": ("record.csv", lambda t: gzip.compress(t.encode()), r"gzipped although"),
     "empty gzip": ("record.csv.gz", lambda t: gzip.compress(b""), r"empty inside"),
-    "Latin-1": ("record.csv", lambda t: t.replace("um", "µm").encode("latin-1"), r"row 2: byte 0xb5 is not UTF-8"),
     "UTF-16": ("record.csv", lambda t: t.encode("utf-16")[:-1], r"utf-16"),
     "binary": ("record.csv", lambda t: bytes(range(256)) * 10, r"record\.csv"),
     "empty MATLAB file": ("record.mat", lambda t: b"", r"empty \(0 bytes\)"),
     "no MATLAB file": ("record.mat", str.encode, r"record\.mat"),
     "no HDF5 file": ("record.h5", str.encode, r"record\.h5"),
-    "spreadsheet": ("record.xlsx", str.encode, r"format is not known.*\.csv"),
+    "spreadsheet": ("record.xlsx", str.encode, r"no sound Excel workbook|openpyxl is not installed"),
+    "pictures": ("record.png", str.encode, r"format is not known.*\.csv"),
 }
 
 

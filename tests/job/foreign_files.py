@@ -52,8 +52,9 @@ def table(
 
     def make(path, s):
         rows = np.column_stack(columns(s))
+        above = heads(s) if callable(heads) else heads
         body = end.join(mark.join(f"{x:.{digits}g}".replace(".", decimal) for x in row) + tail for row in rows)
-        data = (before + end.join([*heads, body, ""])).encode(encoding)
+        data = (before + end.join([*above, body, ""])).encode(encoding)
         path.write_bytes(gzip.compress(data) if pack else data)
 
     file(name)(make)
@@ -126,8 +127,10 @@ table("quoted.csv", ['"time [s]","voltage [V]","current [A]","position [mm]"'], 
 table("bare.txt", [], plain, "\t")
 table("bare_blanks.dat", [], si, "   ", digits=12)
 table("bare_order.txt", [], lambda s: (s.t, s.x * 1e6, s.u, s.i), " ")
-table("fs_line.txt", ["fs = 20000 Hz", "u [V]\ti [A]\tx [mm]"], lambda s: plain(s)[1:], "\t")
-table("interval_line.csv", ["Sample interval,5e-05,s", "u [V],i [A],x [mm]"], lambda s: plain(s)[1:])
+table("fs_line.txt", lambda s: [f"fs = {s.rate:g} Hz", "u [V]\ti [A]\tx [mm]"], lambda s: plain(s)[1:], "\t")
+table(
+    "interval_line.csv", lambda s: [f"Sample interval,{1 / s.rate:g},s", "u [V],i [A],x [mm]"], lambda s: plain(s)[1:]
+)
 table("no_rate.dat", ["u i x"], lambda s: si(s)[1:], " ")
 # oscilloscopes and loggers
 table("pico.csv", ["Time,Channel A,Channel B,Channel C", "(ms),(V),(A),(mm)", ""],
@@ -137,10 +140,21 @@ table("pico_de.csv", ["Zeit;Kanal A;Kanal B;Kanal C", "(ms);(V);(mA);(µm)", ""]
 table("saleae.csv", ["Time [s],Coil voltage,Coil current,Position"], si)
 table("keysight.csv", ["x-axis,1,2,3", "second,Volt,Ampere,Meter"], si)
 table("tektronix.csv", ["Model,MSO24", "Firmware Version,1.2", "", "Waveform Type,ANALOG", "Horizontal Units,s",
-      "Sample Interval,5e-05", "", "TIME,CH1,CH2,CH3", "s,V,A,mm"], plain)  # fmt: skip
-table("rigol.csv", ["X,voltage,current,position,Start,Increment", "Sequence,VOLT,AMPERE,mm,0.000000e+00,5.000000e-05"],
+      "Record Length,6000", "", "TIME,CH1,CH2,CH3", "s,V,A,mm"], plain)  # fmt: skip
+table("rigol.csv", lambda s: ["X,voltage,current,gap,Start,Increment", f"Sequence,VOLT,AMPERE,mm,0.0,{1 / s.rate:e}"],
       lambda s: (np.arange(s.t.size), *plain(s)[1:]), tail=",,")  # fmt: skip
 table("scope_plain_channels.csv", ["Time,CH1,CH2,CH3", "s,V,V,V"], lambda s: (s.t, s.u, s.i, s.x * 1e4))
+table("glued.txt", ["t[s] u[V] i[mA] x[um]"], lambda s: (s.t, s.u, s.i * 1e3, s.x * 1e6), " ")
+table("coil_it.csv", ["Tempo;Tensione bobina;Corrente bobina;Posizione rotore"], plain, ";", ",", "latin-1")
+table("coil_es.csv", ["Tiempo (s);Voltaje (V);Corriente (A);Posición (mm);Temperatura (°C)"],
+      lambda s: (*plain(s), 20 + s.t), ";", ",", "latin-1")  # fmt: skip
+table("coil_zh.csv", ["时间 ms,线圈电压 V,线圈电流 mA,转子位置 um"],
+      lambda s: (s.t * 1e3, s.u, s.i * 1e3, s.x * 1e6), encoding="gb18030")  # fmt: skip
+table("ja_jis.csv", ["時間[ms],コイル電流[A],コイル電圧[V],ギャップ[mm],目標位置[mm]"],
+      lambda s: (s.t * 1e3, s.i, s.u, s.x * 1e3, s.r), encoding="cp932")  # fmt: skip
+table("excel_sep.csv", ["sep=;", "Zeit in s;Spulenspannung in V;Spulenstrom in A;Rotorlage in mm"], plain, ";", ",")
+table("closed_loop.csv", ["time,u_ref,u_meas,i_ref,i_meas,x_set,x_meas"],
+      lambda s: (s.t, np.roll(s.u, 3), s.u, np.roll(s.i, 5), s.i, s.r * 1e-5, s.x))  # fmt: skip
 # what cannot be known
 table("en_all_volts.csv", ["time [s],voltage [V],current [V],position [V]"], lambda s: (s.t, s.u, 0.1 * s.i, s.x * 1e4))
 table("no_position.csv", ["time [s],voltage [V],current [A]"], lambda s: plain(s)[:3])
@@ -212,6 +226,19 @@ def _(path, s):
             for n, x, w in (("Strom", s.i, "A"), ("Weg", 1e3 * s.x, "mm"), ("Spannung", s.u, "V"))
             for t, v in zip(s.t, x, strict=True)]  # fmt: skip
     path.write_text("Kanal;Zeit [s];Wert;Einheit\n" + "\n".join(rows) + "\n")
+
+
+@file("wide.csv")
+def _(path, s):
+    rows = (("time [s]", s.t), ("voltage [V]", s.u), ("current [A]", s.i), ("position [mm]", 1e3 * s.x))
+    path.write_text("\n".join(",".join([name, *(f"{v:.9g}" for v in x)]) for name, x in rows) + "\n")
+
+
+@file("dates.csv")
+def _(path, s):
+    stamps = np.datetime64("2025-04-03T10:11:12") + np.round(s.t * 1e9).astype("timedelta64[ns]")
+    rows = [f"{a},{u:.9g},{i:.9g},{1e3 * x:.9g}" for a, u, i, x in zip(stamps, s.u, s.i, s.x, strict=True)]
+    path.write_text("timestamp,voltage [V],current [A],position [mm]\n" + "\n".join(rows).replace("T", " ") + "\n")
 
 
 @file("arrays.npz")
@@ -331,6 +358,11 @@ def dspace(s, *, order="uix"):
             "RTProgram": "bench.sdf", "Capture": {"SamplePeriod": 1.0}}  # fmt: skip
 
 
+mat("struct_above.mat", lambda s: {"S": {"time": col(s.t), "meas": {"u": col(s.u), "i": col(s.i), "pos": col(s.x)}}})
+mat("simulink_tout.mat", lambda s: {"tout": col(s.t), "yout": {"time": np.empty((0, 0)), "signals": structs(
+    {"values": col(s.u), "dimensions": 1.0, "label": "u"}, {"values": col(s.i), "dimensions": 1.0, "label": "i"},
+    {"values": col(s.x), "dimensions": 1.0, "label": "x"})}})  # fmt: skip
+mat("matrix_index.mat", lambda s: {"M": np.column_stack([np.arange(s.t.size), *si(s)]), "dt": 1 / s.rate})
 mat("dspace.mat", lambda s: {"rec": dspace(s)})
 mat("dspace_packed.mat", lambda s: {"exp_007": dspace(s, order="xiu")})
 mat("simulink_time.mat", lambda s: {"ScopeData": {"time": col(s.t), "signals": structs(

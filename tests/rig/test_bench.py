@@ -136,8 +136,10 @@ def test_draft_of_plain_names_is_ready_to_use(tmp_path, rig_file):
     assert bench_record(source, rig).names == ("voltage", "position", "current")
 
 
-def test_draft_without_position_is_a_coil(tmp_path, rig_file):
-    rig = load_rig(rig_file(draft_rig(record(tmp_path, "time [s],u [V],temp [1],i_coil [A]"))))
+def test_draft_without_position_is_a_coil_where_that_is_told(tmp_path, rig_file):
+    source = record(tmp_path, "time [s],u [V],temp [1],i_coil [A]")
+    assert '[channels.position]\ncolumn = "position"   # CHECK: no column looks like it' in draft_rig(source)
+    rig = load_rig(rig_file(draft_rig(source, coil=True)))
     assert rig.model == "coil"
     assert [c.column for c in rig.channels] == ["u", "i_coil"]
 

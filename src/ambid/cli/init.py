@@ -30,6 +30,8 @@ def command(v: Values) -> None:
         raise AmbidError(f"{given}; a rig file comes from exactly one. Give RECORD, or --preset {WIRED[0]}")
     if v.preset is not None and (v.rate_hz is not None or v.gaps is not None or v.layout):
         raise AmbidError("--rate, --gaps and --layout are for reading a record; --preset reads none. Omit them")
+    if v.preset is not None and (v.column or v.coil):
+        raise AmbidError("--column and --coil are for a record; --preset reads none. Omit them")
     if v.preset is not None and v.plot is not None:
         raise AmbidError("--plot draws the columns of a record; --preset reads none. Omit it")
     with Outputs(v.record, plot=v.plot) as outputs:
@@ -57,24 +59,25 @@ def command(v: Values) -> None:
 
 
 def _of_record(v: Values, outputs: Outputs) -> str:
-    from ambid.record import read_record
-    from ambid.rig import draft_rig
-    from ambid.rig.draft import axes_of
-    from ambid.rig.roles import rank_roles
+    from ambid.job.drafting import draft
 
-    read = read_record(v.record, gaps=v.gaps or "error", **v.only("rate_hz layout"))
-    if v.plot is None and len(axes_of(read)) > 1:
-        return draft_rig(read)
-    ranked = rank_roles(read)
-    if not v.yes and _on_terminal():
-        ranked = {role: _chosen(role, found) for role, found in ranked.items()}
+    ask = None if v.yes or not _on_terminal() else _chosen
+    made = draft(
+        v.record, columns=v.column, coil=bool(v.coil), first=bool(v.yes), choose=ask, gaps=v.gaps or "error",
+        **v.only("rate_hz layout"),
+    )  # fmt: skip
+    if made.guess is None:
+        return made.text
+    ranked = {role: found for role, found in made.guess.ranked.items() if not (v.coil and role == "position")}
     for role, found in ranked.items():
-        typer.echo(f"{role}: {f'{found[0].channel.name}, because {found[0].why}' if found else 'none found'}", err=True)
+        typer.echo(f"{role}: {found[0].channel.name}, because {found[0].why}", err=True)
+    for note in made.guess.notes:
+        typer.echo(note, err=True)
     if v.plot is not None:
         from ambid.report.record import roles_figure  # much is loaded for it
 
-        outputs.draw(v.plot, lambda: roles_figure(read, ranked), lambda _: None)
-    return draft_rig(read, ranked)
+        outputs.draw(v.plot, lambda: roles_figure(made.record, ranked), lambda _: None)
+    return made.text
 
 
 def _on_terminal() -> bool:

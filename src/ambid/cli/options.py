@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -78,8 +79,9 @@ def _read(s: Setting, value: Any) -> Any:
     """Return a value as the job takes it, from the words of a shell."""
     if value is None or s.argument:
         return value
+    words_of = layout_of if s.name == "layout" else partial(layout_of, name=s.name, example="voltage=NAME")
     readers: dict[str, Callable[[Any], Any]] = {
-        "band": lambda x: _band(x, s.name), "words": layout_of, "loop": lambda x: x == "closed", "percent": _share,
+        "band": lambda x: _band(x, s.name), "words": words_of, "loop": lambda x: x == "closed", "percent": _share,
     }  # fmt: skip
     return readers.get(s.kind, lambda x: x)(value)
 
@@ -95,15 +97,14 @@ def _band(text: str, name: str) -> tuple[float, float]:
     return band
 
 
-def layout_of(words: Sequence[str]) -> dict[str, str]:
-    """Read words of a file's layout, each with its value."""
+def layout_of(words: Sequence[str], name: str = "layout", example: str = "decimal=comma") -> dict[str, str]:
+    """Read words of a file's layout, or of another setting, each with its value."""
     layout = dict[str, str]()
     for text in words:
         word, sign, value = text.partition("=")
         if not (sign and value) or word in layout:
             raise AmbidError(
-                f"{setting('layout')} {text!r}: it must be a word and its value, once. Give "
-                f"{setting('layout', 'decimal=comma')}"
+                f"{setting(name)} {text!r}: it must be a word and its value, once. Give {setting(name, example)}"
             )
         layout[word] = value
     return layout

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,8 +14,8 @@ from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import model, model_names
 from ambid.record import Record
 from ambid.record.record import cut
+from ambid.record.words import is_set_point, quantities
 from ambid.rig import Rig
-from ambid.rig.roles import NAMES, SET_POINT
 
 _BINS = 1600  # envelopes of a channel: fewer samples are shown as they are
 _LINES = 1200  # of a spectrum
@@ -64,8 +63,7 @@ def look(
 def _turning(record: Record) -> Array | None:
     """Return turns a second where a channel has both the name and the unit of a speed, (n_samples,)."""
     for c in record.channels:
-        name = c.name.lower()
-        if c.unit in _TURNS and re.search(NAMES["speed"], name) and not re.search(SET_POINT, name):
+        if c.unit in _TURNS and "speed" in quantities(c.name) and not is_set_point(c.name):
             return np.abs(c.values) * _TURNS[c.unit]
     return None
 

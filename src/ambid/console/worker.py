@@ -283,9 +283,9 @@ def _reading(worker: Worker) -> dict[str, Any]:
 def _preview(worker: Worker) -> None:
     """Tell what a record holds, and draft its rig."""
     from ambid.console.look import look
+    from ambid.job.drafting import draft, guess
     from ambid.job.presentation import content
     from ambid.record import read_record
-    from ambid.rig import draft_rig
     from ambid.validation.inspection import inspect
 
     path = worker.path("record")
@@ -303,14 +303,14 @@ def _preview(worker: Worker) -> None:
     worker.feed.tell("look", {**look(record), "limits": {}}, sticky="look")
     worker.tick("diagnostics")
     try:
-        draft = draft_rig(record, reading=how)
+        drafted = draft(record, first=True, **how).text
     except AmbidError as refusal:
-        draft = ""
+        drafted = ""
         worker.note(str(refusal))
     worker.feed.tell(
         "preview",
         {"channels": channels, "t": rounded(record.start_s + starts / record.rate_hz), "rate_hz": record.rate_hz,
-         "samples": record.n_samples, "draft": draft, "content": content(inspect(record))},
+         "samples": record.n_samples, "draft": drafted, "content": content(inspect(record, guess=guess(record)))},
         sticky="preview",
     )  # fmt: skip
 

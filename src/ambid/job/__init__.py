@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from ambid.job.acquiring import acquire as acquire
     from ambid.job.commissioning import commission as commission
     from ambid.job.controller_design import design_controller as design_controller
-    from ambid.job.data import info as info
     from ambid.job.data import load_bench as load_bench
     from ambid.job.data import read_data as read_data
     from ambid.job.data import signals_of as signals_of
+    from ambid.job.drafting import info as info
     from ambid.job.experiment_design import design_experiment as design_experiment
     from ambid.job.fits import compare as compare
     from ambid.job.fits import fit as fit

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ambid.bearing.multistart import Signals
     from ambid.blackbox.data import IOData
     from ambid.physics.linear_model import LinearModel
-    from ambid.validation.inspection import Inspection
 
 Part = tuple[float | None, float | None]
 """From and to, in s; None: the record's own begin or end."""
@@ -304,49 +303,3 @@ def check_same_bench(units: Mapping[str, str], dt: float, second: IOData) -> Non
                 f"channel {name!r} is in {other} in the second record, in {one} in the first; the units must "
                 "agree. Check that it is the same channel, and its unit"
             )
-
-
-def info(
-    record: Source,
-    rig: Rig | str | Path | None = None,
-    *,
-    rate_hz: float | None = None,
-    gaps: GapPolicy | None = None,
-    units: Mapping[str, str] | None = None,
-    layout: Mapping[str, str] | None = None,
-) -> Inspection:
-    """Look through a record: levels, resolution, noise, saturation, drop-outs, outliers, excitation, likely roles.
-
-    Parameters
-    ----------
-    record : file, Record, DataFrame, Dataset or dict of arrays
-    rig : Rig, str or Path, optional
-        Names and calibrates the channels; what the inputs explain then does not count as noise.
-    rate_hz, gaps, units : optional
-        As `ambid.identify`.
-    layout : Mapping of str to str, optional
-        What a file leaves open, as `ambid.record.read_record` takes it.
-
-    Returns
-    -------
-    Inspection
-
-    Raises
-    ------
-    AmbidError
-        If record or rig break a rule.
-
-    Examples
-    --------
-    >>> import ambid
-    >>> found = ambid.info(ambid.simulate("thesis", duration=0.1, seed=1))
-    >>> [c.name for c in found.channels]
-    ['voltage', 'current', 'position']
-    """
-    from ambid.validation.inspection import inspect
-
-    if rig is None:
-        return inspect(read_record(record, rate_hz=rate_hz, gaps=gaps or "error", units=units, layout=layout))
-    bench = known_rig(rig)
-    found = read_bench(record, bench, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
-    return inspect(found, inputs=bench.plant.inputs)

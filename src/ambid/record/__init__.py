@@ -87,7 +87,7 @@ def read_record(
 
         return read_table(source, rate_hz=rate_hz, units=units, gaps=gaps)
     path = Path(source)
-    kind, layout = _format_of(path), dict(layout or {})
+    kind, layout = format_of(path), dict(layout or {})
     if variables is not None and kind not in NAMED:
         raise RecordError(f"{path}: a mapping of variables is for .mat files and arrays by name. Omit it")
     _check_layout(kind, layout, path)
@@ -157,7 +157,7 @@ def read_rows(
 
         return read_table_rows(source, rate_hz=rate_hz, units=units)
     path = Path(source)
-    kind = _format_of(path)
+    kind = format_of(path)
     _check_layout(kind, layout or {}, path)
     if kind == "csv":
         return read_csv_rows(path, rate_hz=rate_hz, layout=layout or {})
@@ -186,7 +186,7 @@ def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = 
         If the format is not known or cannot hold the record.
     """
     path = Path(path)
-    kind = _format_of(path)
+    kind = format_of(path)
     if kind == "csv":
         write_csv(record, path, comments=comments)
         return
@@ -225,7 +225,8 @@ LAYOUTS = {
 """Words by which the layout of a file is told, by format."""
 
 
-def _format_of(path: Path) -> str:
+def format_of(path: Path) -> str:
+    """Return the format that a name ends in."""
     for suffix, kind in _SUFFIXES.items():
         if path.name.lower().endswith(suffix):
             return kind

@@ -29,6 +29,7 @@ _DECIMAL = re.compile(rf"[+-]?(?:[1-9]\d{{0,2}}(?:[.' ]\d{{3}})+|\d*),\d*{_POWER
 _THOUSANDS = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:,\d{{3}})+(?:\.\d*)?{_POWER}")
 _NUMBER = re.compile(rf"[+-]?(?:\d{{1,3}}(?:[.,' ]\d{{3}})+|\d*)(?:[.,]\d*)?{_POWER}")
 _PARENTHESES = re.compile(r"(?P<name>.*\S)\s*\((?P<unit>[^()]*)\)")
+_NO_OTHER = re.compile(r"(?:deg ?|°|º)?[CFK]|m?bar|counts?|lsb|digits?|-|a\.?u\.?", re.IGNORECASE)  # units, not places
 _SPACED = re.compile("\\d([' \u00a0\u202f\u2019])\\d")
 _NAMED_NUMBER = re.compile(
     rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d*[.,]?\d+{_POWER})\s*[,;\t]?\s*"
@@ -344,11 +345,13 @@ def _in_parentheses(
     """Return names and units of ``name (unit)``; None where no unit is written so."""
     matches = [None if "[" in x else _PARENTHESES.fullmatch(x.strip('"')) for x in cells]
     units = [None if x is None else x["unit"].strip() for x in matches]
-    recognised = [_is_unit(x) for x in units if x is not None]
+    recognised = [_is_unit(x) or _NO_OTHER.fullmatch(x) is not None for x in units if x is not None]
     if word not in (None, "parentheses") or not any(recognised) or (word is None and any("[" in x for x in cells)):
         return None
     if word is None and not all(recognised):
-        doubtful = next(x for x in units if x is not None and not _is_unit(x))
+        doubtful = next(
+            x for x, known in zip([x for x in units if x is not None], recognised, strict=True) if not known
+        )
         raise RecordError(
             f"{path}, row {header + 1}: ({doubtful}) is no known unit, others in parentheses are. Say whether "
             f"they are units: {setting('layout', 'units=parentheses')}, or {setting('layout', 'units=none')}"

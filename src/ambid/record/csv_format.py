@@ -83,6 +83,7 @@ def table_of_lines(
     provenance: dict[str, str], told: Mapping[str, object],
 ) -> tuple[Table, float | None]:  # fmt: skip
     """Read a text, line by line; `told`: what its reading has told so far, for the history."""
+    lines = _upright(lines)
     dialect = recognised(lines, path, layout)
     beside: Mapping[str, tuple[float, str | None]] = {}
     texts: Mapping[str, Sequence[str]] = {}
@@ -101,6 +102,18 @@ def table_of_lines(
         header, told = replace(header, names=names, unit_texts=units), {**told, "long": True}
     return table_of(path, header, values, provenance, {**told, **({"layout": dict(layout)} if layout else {})}, rate_hz,
                     beside, texts)  # fmt: skip
+
+
+def _upright(lines: list[str]) -> list[str]:
+    """Return a text of columns where each line is a channel: a name, and then more numbers than there are lines."""
+    few = [x for x in lines if x.strip() and not x.startswith("#")] if len(lines) < _FEW_CHANNELS else []
+    mark = next((d for d in ("\t", ";", ",") if few and all(d in x for x in few)), None)
+    cells = [x.split(mark) for x in few] if mark else []
+    if len(cells) < 2 or len({len(x) for x in cells}) > 1 or len(cells[0]) < max(MIN_SAMPLES + 1, 2 * len(cells)):
+        return lines
+    if any(np.isfinite(_number(x[0])) or not np.isfinite(_number(x[1].replace(",", "."))) for x in cells):
+        return lines
+    return [(mark or ",").join(row) for row in zip(*cells, strict=True)]
 
 
 def _either(below: str | None, behind: str | None) -> str | None:
@@ -198,6 +211,7 @@ def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
 
 _HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
 _BLOCK = 20_000  # rows that are read at once
+_FEW_CHANNELS = 64  # lines of which each may be a channel
 _LONG = 1 << 23  # bytes from which compiled reading saves more than loading it takes
 _HEAD = 1 << 16  # bytes in which the header of a plain file ends
 

@@ -82,9 +82,14 @@ def structures(content: Mapping[str, Any], path: Path) -> dict[str, list[_Signal
     if not groups and len(vectors) < 2:
         signals = list(_matrix(content))
         return {_VECTORS: signals} if signals else {}
+    time = next((v for k, v in vectors.items() if is_time(k)), None)
+    if time is not None:  # of models that save it apart
+        groups = {
+            k: [x if x.time is not None or x.step or x.values.size != time.size else replace(x, time=time) for x in own]
+            for k, own in groups.items()
+        }
     loose = {k: v for k, v in vectors.items() if not is_time(k)} if groups else {}
     if loose:
-        time = next((v for k, v in vectors.items() if is_time(k)), None)
         groups[_VECTORS] = [_Signal(name=k, values=v, units={}, time=time) for k, v in loose.items()]
     return groups
 
@@ -237,8 +242,8 @@ def _stream(signal: _Signal, path: Path, layout: Mapping[str, str]) -> Stream:
     )  # fmt: skip
 
 
-def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
-    """Yield all signals of a variable:
+def _signals(node: Any, name: str, path: Path, above: Array | None = None) -> Iterator[_Signal]:
+    """Yield all signals of a variable; `above`: the time of a struct that it is in.
 
     time, signals(k).values, .label          Simulink, "Structure with time"
     Time, Data, Name, units                  a timeseries as struct, alone, in arrays, fields or Elements{k}.Values
@@ -249,13 +254,13 @@ def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
     """
     if isinstance(node, list):
         for k, x in enumerate(node, 1):
-            yield from _signals(x, f"{name}({k})", path)
+            yield from _signals(x, f"{name}({k})", path, above)
     if not isinstance(node, Mapping):
         return
     fields = {key.lower(): x for key, x in node.items()}
-    time = next(
-        (v for key in (*TIME_NAMES, *filter(is_time, fields)) if (v := _vector(fields.get(key))) is not None), None
-    )
+    clocks = (*TIME_NAMES, *filter(is_time, fields))
+    own = next((v for key in clocks if (v := _vector(fields.get(key))) is not None), None)
+    time = above if own is None else own
     if all(_at(x[0] if isinstance(x, list) and x else x, "Data") is not None for x in map(fields.get, "xy")):
         yield from _dspace(fields, path)
     elif "signals" in fields and "time" in fields:
@@ -271,13 +276,15 @@ def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
         yield from _columns(fields["data"], called, path, _units(node), time=time, time_unit=unit)
     elif "x_values" in fields and "y_values" in fields:
         yield from _testlab(fields, name, path)
-    elif time is not None and any(is_time(k) for k in fields):
-        unit_text = fields.get("units")
-        over = next((u for k in node if is_time(k) and (u := _beside(unit_text, k)["units"])), "s")
+    elif time is not None:
+        over = next((u for k in node if is_time(k) and (u := _beside(fields.get("units"), k)["units"])), "s")
         for key, x in node.items():
             vector = None if is_time(key) else _vector(x)
             if vector is not None and vector.size == time.size:
-                yield _Signal(name=key, values=vector, units=_beside(unit_text, key), time=time, time_unit=over)
+                by_name = _beside(fields.get("units"), key)
+                yield _Signal(name=key, values=vector, units=by_name, time=time, time_unit=over)
+            elif isinstance(x, Mapping | list):
+                yield from _signals(x, key, path, time)
     elif len(vectors := {k: v for k, x in node.items() if (v := _vector(x, MIN_SAMPLES)) is not None}) > 1:
         for key, vector in vectors.items():
             yield _Signal(name=key, values=vector, units=_beside(fields.get("units"), key))

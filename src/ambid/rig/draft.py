@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 
 from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.law_magnet import BEARING_NUMBERS
@@ -42,6 +43,9 @@ def draft_rig(
     ranked: Mapping[str, Sequence[Candidate]] | None = None,
     *,
     reading: Mapping[str, object] | None = None,
+    coil: bool = False,
+    units: Mapping[str, tuple[str, str]] = MappingProxyType({}),
+    variables: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """Guess a rig file.
 
@@ -53,6 +57,12 @@ def draft_rig(
         Columns for each role, the chosen one first; default: as `ambid.rig.roles.rank_roles` ranks them.
     reading : Mapping of str to object, optional
         What the record was read with, ``rate_hz`` or ``gaps``: others of its bench are read alike.
+    coil : bool, optional
+        Draft the coil alone.
+    units : Mapping of str to (str, str), optional
+        Unit by role where it is not that of the record, and why.
+    variables : Mapping of str to str, optional
+        Path of the variable by role, and of time, where the columns were named so.
 
     Returns
     -------
@@ -64,8 +74,7 @@ def draft_rig(
     if len(axes) > 1:
         return _draft_rotor(record, axes, reading or {})
     ranked = rank_roles(record) if ranked is None else ranked
-    coil, resting = bool(ranked["voltage"] and ranked["current"]), at_rest(ranked)
-    plant = model("coil" if coil and (resting or not ranked["position"]) else "one-axis")
+    plant, resting = model(model_of(ranked, coil=coil)), not coil and at_rest(ranked)
     name = record.provenance.get("file", "a record")
     lines = [
         f"# Guessed from {name}: check every line marked CHECK, then run: "
@@ -74,11 +83,14 @@ def draft_rig(
         f"name   = {toml_text(f'bench of {name}')}",
         f'model  = "{plant.name}"'
         + ("   # CHECK: the position does not move with voltage and current" if resting else ""),
+        f"# Time: {_clock_words(record)}",
         "",
     ]
-    units = role_units(plant)
+    wanted = role_units(plant)
     for role in (*plant.inputs, *plant.outputs):
-        lines += [*_channel_lines(role, ranked[role], units[role], record, is_input=role in plant.inputs), ""]
+        own = _channel_lines(role, ranked[role], wanted[role], record, units.get(role), is_input=role in plant.inputs)
+        own[1:1] = [f"variable = {toml_text(variables[role])}"] if role in variables else []
+        lines += [*own, ""]
     for role, column in _turning(record).items():
         lines += [f"[channels.{role}]", f"column = {toml_text(column.name)}   # CHECK", ""]
     lines += [
@@ -92,12 +104,27 @@ def draft_rig(
         "# [operating_point]   # default: the means of the record",
         '# position = { value = 10.0, unit = "mm" }',
         "",
-        *_record_lines(record, reading or {}),
+        *_record_lines(record, {**(reading or {}), **_clock(variables)}),
         "# from = 2.0          # s: leave out what comes before, such as the pick-up from rest",
         '# gaps = "error"      # or "interpolate", "cut"',
         _RATE_SD,
     ]
     return "\n".join(lines) + "\n"
+
+
+def model_of(ranked: Mapping[str, Sequence[Candidate]], *, coil: bool = False) -> str:
+    """Return the model of columns: a coil where that is told, or where the position does not move with it."""
+    return "coil" if coil or at_rest(ranked) else "one-axis"
+
+
+def _clock_words(record: Record) -> str:
+    """Say what was taken as time, and why."""
+    settings = record.history[0].settings if record.history else {}
+    return f"{settings.get('time', 'as the record names it')}; {record.rate_hz:g} Hz"
+
+
+def _clock(variables: Mapping[str, str]) -> Mapping[str, object]:
+    return {"time": {"variable": variables["time"], "unit": "s"}} if "time" in variables else {}
 
 
 def _record_lines(record: Record, reading: Mapping[str, object]) -> list[str]:
@@ -159,7 +186,9 @@ def _turning(record: Record) -> dict[str, Channel]:
     return channels
 
 
-def _channel_lines(role: str, ranked: Sequence[Candidate], unit: str, record: Record, *, is_input: bool) -> list[str]:
+def _channel_lines(
+    role: str, ranked: Sequence[Candidate], unit: str, record: Record, told: tuple[str, str] | None, *, is_input: bool
+) -> list[str]:
     lines = [f"[channels.{role}]"]
     if not ranked:
         listing = ", ".join(f"{x.name} [{x.source_unit}]" for x in record.channels)
@@ -168,7 +197,9 @@ def _channel_lines(role: str, ranked: Sequence[Candidate], unit: str, record: Re
     lines += [f"# {x.channel.name}: score {x.score:.2f}; {x.why}" for x in ranked]
     note = f"   # CHECK; or {', '.join(x.name for x in others)}" if others else "   # CHECK"
     lines.append(f"column = {toml_text(c.name)}{note}")
-    if c.unit == UNKNOWN:
+    if told is not None:
+        lines.append(f'unit   = "{told[0]}"   # CHECK: {told[1]}')
+    elif c.unit == UNKNOWN:
         lines.append(f'unit   = "{unit}"   # CHECK: the record names no unit for it')
     elif c.unit != unit:
         lines += [

@@ -17,7 +17,7 @@ from ambid.physics.law_magnet import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
-from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
+from ambid.record import NAMED, Channel, GapPolicy, Record, Source, Step, format_of, read_record
 from ambid.record.calibration import Calibration
 from ambid.rig.calibration import calibration_of, channel_sd_of, plane_sd_of
 from ambid.rig.rig import (
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     )
 
 
+_FIRST = "Let 'ambid init' draft a rig of the record"
 SELECTED = Step(name="select")
 """Says in the history of a record that its channels are named by role and calibrated."""
 
@@ -525,13 +526,13 @@ def read_columns(
     layout: Mapping[str, str] | None = None,
 ) -> Record:
     """Read a record as `read_bench`, its columns still as they are in the file."""
-    mat = isinstance(source, (str, Path)) and Path(source).suffix.lower() == ".mat"
+    named = isinstance(source, (str, Path)) and format_of(Path(source)) in NAMED
     if rate_hz is None and not isinstance(source, Record):  # a record may have been resampled since
         rate_hz = rig.record.rate_hz
     return read_record(
         source, rate_hz=rate_hz, gaps=gaps or rig.record.gaps or "error", units=units,
         layout=None if isinstance(source, Record) else {**rig.record.layout, **(layout or {})},
-        variables={**{x: (x, UNKNOWN) for x in beside}, **mat_variables(rig)} if mat else None,
+        variables={**{x: (x, UNKNOWN) for x in beside}, **mat_variables(rig)} if named else None,
     )  # fmt: skip
 
 
@@ -586,9 +587,10 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
         return _through_a_rig(record, rig, wanted)
     for c in rig.channels:
         if c.column not in record.names:
+            remedy = f"Correct channels.{c.role}.column" if rig.source is not None else _FIRST
             raise RecordError(
                 f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
-                f" {choices(c.column, record.names)} Correct channels.{c.role}.column"
+                f" {choices(c.column, record.names)} {remedy}"
             )
     found = {c.role: _in_declared_unit(record.channel(c.column), c) for c in rig.channels}
     _refuse_swapped(found, wanted, rig)

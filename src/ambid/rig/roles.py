@@ -14,6 +14,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError
+from ambid.record.clock import even, rises
 from ambid.record.record import Channel, Record
 from ambid.record.words import is_set_point, quantities, unit_or_none, unit_within
 from ambid.signals.spectra import cross_spectra, snr
@@ -58,15 +59,22 @@ class Candidate:
         return self.named * (1.0 + self.signal + 2.0 * self.fits) / 4.0
 
 
-def rank_roles(record: Record) -> Mapping[str, Sequence[Candidate]]:
+def rank_roles(record: Record, told: Mapping[str, str] | None = None) -> Mapping[str, Sequence[Candidate]]:
     """Rank the columns for each role of a bearing, the best first; those chosen for different roles differ.
 
-    `record`: as read from its file, columns under their own names. Returns voltage, current and position; empty where
-    no column looks like one.
+    `record`: as read from its file, columns under their own names; `told`: columns that are known, by role. Returns
+    voltage, current and position; empty where no column looks like one.
     """
+    told = told or {}
     ranked = {
         role: sorted((_named(c, role, record) for c in record.channels if _name(c, role)), key=lambda c: -c.score)
+        if role not in told
+        else [replace(_named(record.channel(told[role]), role, record), named=1.0)]
         for role in ROLES
+    }
+    ranked = {
+        role: [c for c in cs if c.channel.name == told.get(role) or c.channel.name not in told.values()]
+        for role, cs in ranked.items()
     }
     likely = {role: [c for c in cs if c.signal > 0][:_CANDIDATES] for role, cs in ranked.items()}
     coils = _coils(record, likely)
@@ -94,6 +102,8 @@ def _name(c: Channel, role: str) -> float:
     if is_set_point(c.name):
         return 0.0
     names, unit = quantities(c.name), unit_of(c)
+    if not names and c.unit == UNKNOWN and rises(c.values) and even(c.values):
+        return 0.0  # it counts
     if unit == ROLES[role]:
         return 1.0 if role in names else 0.8
     if unit not in ("1", UNKNOWN, *(["V"] if role in names else [])):

@@ -29,7 +29,7 @@ _IN_PYTHON = ("units", "samples", "path")  # what the command has no option for
 _UNITS = ("_s", "_hz", "_rpm")
 # What a setting of the command is in Python, where it is no argument.
 _PYTHON = {"json": "save()", "plot": "plot()", "report": "report()", "identify_nonlinear": "ambid.identify_nonlinear"}
-_BY_WORD = ("layout", "limits", "spread")  # settings that hold values by a word, such as group=NAME
+_BY_WORD = ("column", "layout", "limits", "spread")  # settings that hold values by a word, such as group=NAME
 # Jobs whose command or call is not the job's own name: words and switches; function.
 _COMMANDS = {
     "identify_nonlinear": ("identify", "identify_nonlinear"), "alarms": ("history", "alarms"),

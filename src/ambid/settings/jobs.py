@@ -224,7 +224,7 @@ _JOBS = (
     ),
     declare(
         "init",
-        "record out preset plot yes rate_hz gaps layout force",
+        "record out column coil preset plot yes rate_hz gaps layout force",
         record={"required": False},
         out={"help": "Rig file to write.", "shown": "standard output", "required": False, "metavar": "RIG"},
         plot={"help": "Draw the columns that may be a role: signals, coherences, scores."},

@@ -66,6 +66,15 @@ SETTINGS = (
         choices=("open", "closed"),
         shown="as the bench usually works",
     ),
+    Setting("coil", "switch", "", "Draft the coil alone, without a position."),
+    Setting(
+        "column",
+        "words",
+        "ROLE=COLUMN",
+        "Which column, or path such as 'rec.Y(2).Data', is voltage, current, position or time, its unit behind it in"
+        " brackets; repeatable.",
+        many=True,
+    ),
     Setting(
         "criterion",
         "text",

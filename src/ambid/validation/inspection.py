@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ambid.errors import AmbidError, RecordError, nearest
 from ambid.estimation.result import Reason, Result
 from ambid.record import Channel, Record
-from ambid.rig.roles import rank_roles
+from ambid.rig.roles import Candidate
 from ambid.settings.caller import setting
 from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
 from ambid.units import UNKNOWN
@@ -67,12 +67,25 @@ class Inspection(Result):
         return channel
 
 
-def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
-    """Look through a record; `inputs`: those of a rig, through which it was read."""
+class Guess(Protocol):
+    """What columns are taken for, as `ambid.job.drafting.guess` tells."""
+
+    @property
+    def ranked(self) -> Mapping[str, Sequence[Candidate]]:
+        """Columns by role."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Time and units that the record does not say, and what cannot be told."""
+
+
+def inspect(record: Record, *, inputs: Sequence[str] = (), guess: Guess | None = None) -> Inspection:
+    """Look through a record; `inputs`: those of a rig, through which it was read; `guess`: what its columns may be."""
     method = f"the part that 20 lags of the channel{' and of ' + ', '.join(inputs) if inputs else ''} do not predict"
     notes = [f"SNR: noise is {method}{'' if inputs else '; without a rig a lower bound'}"]
     notes += [_excitation(record, name) for name in inputs or record.names]
-    ranked = {} if inputs else rank_roles(record)
+    ranked = {} if guess is None else guess.ranked
+    notes += () if guess is None else guess.notes
     known = facts(record) if {"voltage", "current", "position"} <= set(record.names) else {}
     notes += [c.detail for name, c in known.items() if c.passed and name in ("ohm", "belonging", "weight")]
     against = [

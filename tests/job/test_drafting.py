@@ -1,0 +1,117 @@
+"""Any file of numbers: what `init` drafts of it identifies the same bearing, or one question says what is missing."""
+
+import re
+
+import numpy as np
+import pytest
+
+from ambid.errors import AmbidError
+from ambid.job import identify, info
+from ambid.job.drafting import draft
+from ambid.rig import load_rig
+from tests.job.foreign_files import FILES, QUESTIONS, signals
+from tests.tiers import ALL
+
+SHORT = (
+    "de_latin.csv", "short_axis.csv", "es_bare_um_mA.csv", "rigol.csv", "labview_multi.lvm", "bare_order.txt",
+    "long.csv", "wide.csv", "ja_jis.csv", "closed_loop.csv", "matrix_names.npz", "dspace_packed.mat", "figure.fig",
+    "plain.h5", "two_positions.csv", "wrong_mm.csv", "no_position.csv", "no_rate.dat", "scope_plain_channels.csv",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def record():
+    return signals()
+
+
+@pytest.fixture(scope="module")
+def truth(record):
+    columns = {"voltage [V]": record.u, "current [A]": record.i, "position [m]": record.x}
+    return {p.name: p for p in identify(columns, rate_hz=record.rate).parameters if p.sd}
+
+
+@pytest.mark.parametrize("name", FILES if ALL else SHORT)
+def test_a_file_ends_in_the_same_parameters_or_in_one_question(tmp_path, record, truth, name):
+    if name.endswith(".xlsx"):
+        pytest.importorskip("openpyxl", reason="openpyxl, of ambid[formats], is not installed")
+    path = tmp_path / name
+    FILES[name](path, record)
+
+    def through():
+        (tmp_path / "rig.toml").write_text(draft(path).text, encoding="utf-8")
+        return identify(path, tmp_path / "rig.toml")
+
+    if name in QUESTIONS:
+        with pytest.raises(AmbidError) as asked:
+            through()
+        assert "\n" not in str(asked.value)
+        assert re.search(r"Say which|rate_hz|gain or table", str(asked.value))
+        return
+    found = {p.name: p for p in through().parameters}
+    for key, p in truth.items():
+        assert abs(found[key].value - p.value) < 0.2 * p.sd
+
+
+def test_there_are_files_of_every_form():
+    assert len(FILES) - len(QUESTIONS) >= 55
+
+
+def drafted(tmp_path, record, name, **told):
+    FILES[name](tmp_path / name, record)
+    (tmp_path / "rig.toml").write_text(draft(tmp_path / name, **told).text, encoding="utf-8")
+    return load_rig(tmp_path / "rig.toml")
+
+
+def test_a_question_is_answered_by_a_column_and_its_unit(tmp_path, record, truth):
+    paths = {"time": "rec.X.Data", "voltage": "rec.Y(1).Data [V]", "current": "rec.Y(2).Data [A]"}
+    paths |= {"position": "rec.Y(3).Data [mm]"}
+    for name, told in (
+        ("two_positions.csv", {"columns": {"position": "position 1"}}),
+        ("wrong_mm.csv", {"columns": {"position": "position [m]"}}),
+        ("scope_plain_channels.csv", {"columns": {"current": "CH2 [A]", "position": "CH3"}}),
+        ("dspace.mat", {"columns": paths}),
+        ("no_rate.npy", {"rate_hz": record.rate}),
+    ):
+        rig = drafted(tmp_path, record, name, **told)
+        if name == "scope_plain_channels.csv":
+            assert [c.column for c in rig.channels] == ["CH1", "CH3", "CH2"]
+            continue
+        found = {p.name: p.value for p in identify(tmp_path / name, rig, rate_hz=told.get("rate_hz")).parameters}
+        assert found["R"] == pytest.approx(truth["R"].value, rel=1e-3)
+        assert found["m"] == pytest.approx(truth["m"].value, rel=1e-3)
+
+
+def test_a_coil_is_taken_where_it_is_asked_for(tmp_path, record):
+    assert drafted(tmp_path, record, "no_position.csv", coil=True).model == "coil"
+
+
+def test_the_rig_says_what_was_taken_as_time_and_in_which_unit(tmp_path, record):
+    FILES["short_axis.csv"](tmp_path / "short_axis.csv", record)
+    made = draft(tmp_path / "short_axis.csv")
+    assert "# Time: 'time_ms', because its name says so, and it rises, in [ms] by its name; 20000 Hz" in made.text
+    assert re.search(r'unit   = "um" +# CHECK: its name ends in it', made.text)
+    assert made.guess.ranked["voltage"][0].channel.name == "U_A"
+    seen = info(tmp_path / "short_axis.csv")
+    assert seen.roles["position"][0].startswith("pos_um")
+    assert "time: 'time_ms', because its name says so, and it rises, in [ms] by its name" in seen.notes
+    assert any("position" in x and "[um]" in x for x in seen.notes)
+
+
+def test_a_setting_that_names_nothing_is_refused(tmp_path, record):
+    for columns, said in (
+        ({"position": "nothing"}, r"has no column 'nothing'"),
+        ({"positon": "position"}, r"no role 'positon'.*Did you mean 'position'"),
+    ):
+        with pytest.raises(AmbidError, match=said):
+            drafted(tmp_path, record, "en.csv", columns=columns)
+
+
+def test_text_whose_columns_show_nothing_asks_and_shows_their_ranges(tmp_path):
+    random = np.random.default_rng(1)
+    rows = np.column_stack([np.arange(400) * 1e-4, random.normal(size=(400, 3))])
+    np.savetxt(tmp_path / "noise.txt", rows)
+    with pytest.raises(
+        AmbidError,
+        match=r"no column looks like the voltage or the current or the position; there are column 2 \[\?\] -",
+    ):
+        draft(tmp_path / "noise.txt")
