@@ -49,7 +49,7 @@ def test_a_change_is_written_with_its_truth_and_told(here, ambid):
     )
     for name in wanted.record.names:
         assert np.array_equal(record[name], wanted.record[name])
-    comments = [line for line in (here / "r.csv").read_text().splitlines() if line.startswith("#")]
+    comments = read_record(here / "r.csv").provenance["comment"].splitlines()
     assert any("scenario change of -0.3 (relative change of k_i)" in line for line in comments)
     assert any("k_i 55.7335 to 39.0135" in line for line in comments)
 

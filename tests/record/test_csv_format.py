@@ -4,6 +4,7 @@ import gzip
 import hashlib
 
 import numpy as np
+import pandas
 import pytest
 
 from ambid.errors import RecordError
@@ -98,6 +99,9 @@ def test_round_trip_keeps_every_bit(tmp_path):
         assert [c.unit for c in back.channels] == ["m", "?"]
         assert back["position"].values.tobytes() == values.tobytes()
         assert back.provenance["comment"] == "made by a test"
+        assert pandas.read_csv(tmp_path / name)["position [m]"].to_numpy().tobytes() == values.tobytes()
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + (b"" if name.endswith("gz") else b"\n"))
+    assert "comment" not in read_record(tmp_path / "a.csv").provenance  # it is another file now
 
 
 def test_equal_records_give_equal_files(tmp_path):

@@ -52,7 +52,8 @@ def command(v: Values) -> None:
                 _recipe(v.rig, f"{told.kind} of {told.peak:.6g} {told.unit}{between}", v.seed),
                 f"truth: {truth_words(done)}",
             )
-        outputs.stage(v.out, lambda path: write_record(made, path, comments=comments))
+        outputs.stage(v.out, lambda path: write_record(made, path))
+        outputs.stage_notes(v.out, comments)
     warn(done)
     n, rate_hz = done.record.n_samples, done.record.rate_hz
     typer.echo(
@@ -95,14 +96,15 @@ def _run_scenario(v: Values, preset: Preset | None) -> None:
         def write(path: Path) -> None:
             nonlocal lost
             if not what.dropped:
-                write_record(done.record, path, comments=comments)
+                write_record(done.record, path)
                 return
             first = round(told["from_s"] * done.record.rate_hz)
             share = told["size"]
-            found = damage(done.record, path, share=share, seed=v.seed, first=first, comments=comments)
+            found = damage(done.record, path, share=share, seed=v.seed, first=first)
             lost = sum(x.stop - x.first for x in found)
 
         outputs.stage(record, write)
+        outputs.stage_notes(record, comments)
     warn(done)
     n, rate = done.record.n_samples, done.record.rate_hz
     short = f", {lost} of them lost or without a value" if lost else ""

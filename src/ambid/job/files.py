@@ -14,6 +14,7 @@ from ambid.settings.caller import setting
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm", ".pdf")
+_NOTES = "-metadata.json"  # the ending of what belongs to another file
 _LOOKED = 64  # bytes of a file that say what it is
 _MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
 EXPORT_ENDINGS = (".mat", ".py", ".c", ".h", ".fmu")
@@ -99,6 +100,14 @@ class Files:
         """Write a UTF-8 text file under a name beside `path`."""
         self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
+    def stage_notes(self, path: Path, comments: Sequence[str]) -> None:
+        """Write what is to be said of a CSV file that is staged, into the file beside it."""
+        if comments:
+            from ambid.record.csv_format import notes_path, notes_text
+
+            data = self._staged[path.resolve()].read_bytes()
+            self.stage_text(notes_path(path), notes_text(path.name, data, comments))
+
     def replaced(self, path: Path) -> None:
         """Take note that a file is going to be replaced."""
 
@@ -109,7 +118,7 @@ class Files:
         try:
             if kind is None:
                 for path, beside in self._staged.items():
-                    if path.exists() and path.stat().st_size:
+                    if path.exists() and path.stat().st_size and not path.name.endswith(_NOTES):
                         self.replaced(path)
                     os.replace(beside, path)
         finally:
@@ -132,7 +141,17 @@ def _made_here(path: Path, drawn: tuple[bytes, ...]) -> bool:
                 return b"simulat" in found["provenance"][()]
     except (OSError, EOFError, KeyError, TypeError, ValueError, zlib.error):  # damaged: nobody knows what it was
         return False
+    if path.name.endswith((".csv", ".csv.gz")) and _noted(path):
+        return True
     return not begin or begin.startswith((*_MADE, *drawn)) or (begin.startswith(b"PK") and _ARCHIVE in begin)
+
+
+def _noted(path: Path) -> bool:
+    """Whether the notes beside a CSV file say that it was simulated."""
+    from ambid.record.csv_format import notes_of
+    from ambid.record.record import sha256_of
+
+    return any(f"# {line}".encode().startswith(_MADE) for line in notes_of(path, sha256_of(path.read_bytes())))
 
 
 def _same(a: Path, b: Path) -> bool:

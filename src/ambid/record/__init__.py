@@ -178,7 +178,7 @@ def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = 
     path : str or Path
         ``.csv``, ``.csv.gz`` (values and units only), ``.h5`` or ``.hdf5`` (everything).
     comments : sequence of str
-        Comment lines for CSV; HDF5 has the history instead and refuses them.
+        For CSV, into a file ``NAME-metadata.json`` beside it; HDF5 has the history instead and refuses them.
 
     Raises
     ------

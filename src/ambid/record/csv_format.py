@@ -5,6 +5,7 @@ by semicolons or tabs where the header has no comma (told in the history). Rows 
 from __future__ import annotations
 
 import gzip
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -126,8 +127,9 @@ def table_of(
     texts: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> tuple[Table, float | None]:  # fmt: skip
     """Find time among the columns."""
-    if header.comments:
-        provenance["comment"] = "\n".join(header.comments)
+    comments = [*header.comments, *notes_of(path, provenance["sha256"])]
+    if comments:
+        provenance["comment"] = "\n".join(comments)
     layout, place = told.get("layout"), f"{path}, row {header.row}"
     layout = layout if isinstance(layout, Mapping) else {}
     names, units = header.names, header.unit_texts
@@ -180,10 +182,11 @@ def pivoted(
 
 def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:
     """Write a record as CSV in SI, every value read back to the last bit, gzipped if it ends in ``.gz``. History and
-    provenance are not kept (HDF5 keeps them); `comments` go before the header row, each after ``#``.
+    provenance are not kept (HDF5 keeps them); `comments` go into a file beside it (`notes_path`), so that any program
+    opens the table.
     """
     path = Path(path)
-    lines = head_lines(record, comments)
+    lines = head_lines(record)
     for c in record.channels:
         if not np.isfinite(c.values).all():
             k = int(np.argmax(~np.isfinite(c.values)))
@@ -195,18 +198,41 @@ def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ())
         data = gzip.compress(data, compresslevel=6, mtime=0)  # no date inside: equal records give equal files
     try:
         path.write_bytes(data)
+        if comments:
+            notes_path(path).write_text(notes_text(path.name, data, comments), encoding="utf-8")
     except OSError as failure:
         raise RecordError(f"{path} cannot be written: {failure.strerror or failure}. Check the folder") from None
 
 
-def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
-    """Return what stands above the numbers: `comments`, each after ``#``, then the header row."""
+def notes_path(path: Path) -> Path:
+    """Return the file beside a CSV file that tells of it, named as CSV on the Web (W3C 2015, sec. 5.3) does."""
+    return path.with_name(f"{path.name}-metadata.json")
+
+
+def notes_text(name: str, data: bytes, comments: Sequence[str]) -> str:
+    """Return what stands in it: the comments, and the SHA-256 of the file that they belong to."""
+    lines = [line for text in comments for line in text.splitlines()]
+    notes = {"@context": "http://www.w3.org/ns/csvw", "url": name, "sha256": sha256_of(data), "rdfs:comment": lines}
+    return json.dumps(notes, indent=1) + "\n"
+
+
+def notes_of(path: Path, digest: str) -> tuple[str, ...]:
+    """Return the comments beside a CSV file of this SHA-256; none where there are none, or of another file."""
+    try:
+        notes = json.loads(notes_path(path).read_text(encoding="utf-8"))
+        return tuple(str(x) for x in notes["rdfs:comment"]) if notes["sha256"] == digest else ()
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()
+
+
+def head_lines(record: Record) -> list[str]:
+    """Return what stands above the numbers: the header row."""
     for c in record.channels:
         if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in TIME_NAMES:
             raise RecordError(f"channel {c.name!r} cannot be a CSV column: its name would be misread. Rename it")
     units = [c.source_unit if c.unit == UNKNOWN else c.unit for c in record.channels]
     names = [c.name if u == UNKNOWN else f"{c.name} [{u}]" for c, u in zip(record.channels, units, strict=True)]
-    return [*(f"# {line}" for text in comments for line in text.splitlines()), ",".join(["time [s]", *names])]
+    return [",".join(["time [s]", *names])]
 
 
 _HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")

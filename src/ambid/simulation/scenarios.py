@@ -18,6 +18,7 @@ from ambid.arrays import Array
 from ambid.errors import ModelError, RecordError, choices
 from ambid.physics.presets import Preset
 from ambid.record import write_record
+from ambid.record.csv_format import notes_path, notes_text
 from ambid.record.record import Channel, Record, Step
 from ambid.signals import multisine
 from ambid.simulation.bench import TRUE, Simulation, VaryingLoop, join
@@ -75,7 +76,7 @@ def damage(
     if not path.name.lower().endswith((".csv", ".csv.gz")):
         raise RecordError(f"{path}: lost samples can be written as CSV only. Write .csv or .csv.gz")
     lost = losses(record.n_samples, share, seed, first=first)
-    write_record(record, path, comments=comments)
+    write_record(record, path)
     packed = path.suffix.lower() == ".gz"
     data = path.read_bytes()
     lines = (gzip.decompress(data) if packed else data).decode().split("\n")
@@ -89,7 +90,10 @@ def damage(
                 cells[j] = ""
             lines[k] = "" if loss.kind == "skipped" else ",".join(cells)
     text = "\n".join(line for line in lines if line) + "\n"
-    path.write_bytes(gzip.compress(text.encode(), compresslevel=6, mtime=0) if packed else text.encode())
+    data = gzip.compress(text.encode(), compresslevel=6, mtime=0) if packed else text.encode()
+    path.write_bytes(data)
+    if comments:
+        notes_path(path).write_text(notes_text(path.name, data, comments), encoding="utf-8")
     return lost
 
 
