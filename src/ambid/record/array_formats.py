@@ -16,7 +16,7 @@ from ambid.errors import RecordError, choices
 from ambid.record.csv_format import table_of_lines
 from ambid.record.frames import imported
 from ambid.record.mat_format import content_of_hdf5, read_content
-from ambid.record.record import Record, file_bytes, sha256_of
+from ambid.record.record import Record, file_bytes, provenance_of
 from ambid.record.sampling import GapPolicy, check_gap_policy, uniform_record
 from ambid.record.streams import refuse_claim
 
@@ -38,8 +38,8 @@ def read_numpy(
     for name, x in content.items():
         plain |= {field: x[field] for field in x.dtype.names} if x.dtype.names else {name: x}
     return read_content(
-        plain, path, sha256_of(data), path.suffix.lower()[1:], variables=variables, rate_hz=rate_hz, gaps=gaps,
-        layout=layout,
+        plain, path, provenance_of(path, data), path.suffix.lower()[1:], variables=variables, rate_hz=rate_hz,
+        gaps=gaps, layout=layout,
     )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def read_foreign_hdf5(
     return read_content(
         content,
         path,
-        sha256_of(file_bytes(path)),
+        provenance_of(path, file_bytes(path)),
         "hdf5",
         variables=variables,
         rate_hz=rate_hz,
@@ -89,7 +89,7 @@ def read_xlsx(
     while lines and not lines[-1]:
         lines.pop()
     told = {"sheet": name}
-    provenance = {"file": path.name, "sha256": sha256_of(data)}
+    provenance = dict(provenance_of(path, data))
     table, rate = table_of_lines([*lines, ""], path, gaps, layout, rate_hz, provenance, told)
     return uniform_record(table, rate, gaps)
 

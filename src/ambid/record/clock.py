@@ -138,7 +138,8 @@ def _plausible(time: Array) -> list[str]:
 
 
 def _period(time: Array) -> float:
-    steps = np.diff(time[np.isfinite(time)][:_LOOKED])
+    head = time[:_LOOKED]
+    steps = np.diff(head[np.isfinite(head)])
     return float(np.median(steps)) if steps.size else 0.0
 
 

@@ -44,7 +44,7 @@ def read_tdms(
         streams = [_tdms_stream(c) for c in numeric]
         left = [c.name for c in groups[group] if c not in numeric]
         settings = {"format": "tdms", "group": group, **({"left_out": left} if left else {})}
-        return record_of(path, digest, streams, settings, layout, rate_hz, gaps)
+        return record_of(path, {"file": path.name, "sha256": digest}, streams, settings, layout, rate_hz, gaps)
 
 
 def _tdms_stream(channel: Any) -> Stream:
@@ -100,7 +100,7 @@ def read_mdf(
                 )
             )  # fmt: skip
         settings = {"format": f"mdf {mdf.version}", "group": group, **({"left_out": left} if left else {})}
-        return record_of(path, digest, streams, settings, layout, rate_hz, gaps)
+        return record_of(path, {"file": path.name, "sha256": digest}, streams, settings, layout, rate_hz, gaps)
 
 
 def _opened_mdf(asammdf: Any, file: Any) -> Any:
@@ -150,7 +150,7 @@ def read_parquet(
             raise RecordError(f"record {path}: column {twice!r} occurs twice; names must differ. Rename one")
         left = [f.name for f in schema if f not in numeric]
         settings = {"format": kind, **({"left_out": left} if left else {})}
-        return record_of(path, digest, streams, settings, layout, rate_hz, gaps)
+        return record_of(path, {"file": path.name, "sha256": digest}, streams, settings, layout, rate_hz, gaps)
 
 
 def _opened_table(path: Path) -> tuple[Any, int, Callable[[str], Iterator[np.ndarray]], str]:

@@ -4,6 +4,7 @@ variables as MATLAB does, ``i``, ``data.i``, ``y(:,2)``, and their units; `mat_s
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import struct
@@ -19,7 +20,7 @@ from ambid.errors import RecordError
 from ambid.record.clock import TIME_NAMES, clock_of, seconds, unit_words
 from ambid.record.hdf5_format import hdf5_of
 from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, scalars, structures
-from ambid.record.record import Record, file_bytes, sha256_of
+from ambid.record.record import Record, file_bytes, provenance_of
 from ambid.record.sampling import GapPolicy, Table, check_gap_policy, refuse_gaps, uniform_record
 from ambid.record.streams import refuse_claim
 from ambid.record.words import is_time
@@ -130,14 +131,14 @@ def read_mat(
     check_gap_policy(gaps)
     data = file_bytes(path)
     return read_content(
-        _content(path, data), path, sha256_of(data), "mat", variables=variables, rate_hz=rate_hz, gaps=gaps,
+        _content(path, data), path, provenance_of(path, data), "mat", variables=variables, rate_hz=rate_hz, gaps=gaps,
         layout=layout or {},
     )  # fmt: skip
 
 
 def read_content(
-    content: Mapping[str, Any], path: Path, digest: str, kind: str, *, variables: Mapping[str, tuple[str, str]] | None,
-    rate_hz: float | None, gaps: GapPolicy, layout: Mapping[str, str],
+    content: Mapping[str, Any], path: Path, provenance: Mapping[str, str], kind: str, *,
+    variables: Mapping[str, tuple[str, str]] | None, rate_hz: float | None, gaps: GapPolicy, layout: Mapping[str, str],
 ) -> Record:  # fmt: skip
     """Make a record of variables: structs are mappings, arrays of them and cells are lists."""
     listed = [
@@ -148,7 +149,7 @@ def read_content(
         refuse_foreign(content, path)
         groups = structures(content, path)
     if groups and not listed:
-        return read_structures(path, digest, groups, layout, rate_hz, gaps, kind, scalars(content))
+        return read_structures(path, provenance, groups, layout, rate_hz, gaps, kind, scalars(content))
     if set(layout) - {"time", "time_unit"}:
         why = f"the rig names the variable {listed[0]}" if listed else "it has no structure with signals"
         raise RecordError(f"record {path}: a layout is for structures; {why}. Omit the layout")
@@ -169,7 +170,7 @@ def read_content(
     table = Table(
         where=str(path), names=names, values=values, first_row=1, time=time,
         unit_texts=tuple(None if unit == UNKNOWN else unit for _, unit in mapping.values()),
-        provenance={"file": path.name, "sha256": digest},
+        provenance=provenance,
         settings={"format": kind, "variables": {name: expression for name, (expression, _) in mapping.items()}, **told},
     )  # fmt: skip
     if gaps == "error":
@@ -216,7 +217,9 @@ def _content(path: Path, data: bytes) -> dict[str, Any]:
         with warnings.catch_warnings():  # objects are all called None; any other name that occurs twice is a failure
             warnings.filterwarnings("error", message="Duplicate variable")
             warnings.filterwarnings("ignore", message='Duplicate variable name "None"')
-            content = loadmat(path, struct_as_record=False, squeeze_me=False, verify_compressed_data_integrity=True)
+            content = loadmat(
+                io.BytesIO(data), struct_as_record=False, squeeze_me=False, verify_compressed_data_integrity=True
+            )
     except Exception as failure:  # loadmat raises whatever its parser meets in a damaged file
         raise RecordError(
             f"record {path} is not a valid MATLAB file ({type(failure).__name__}: {failure}). Save it again from MATLAB"

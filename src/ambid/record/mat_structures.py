@@ -160,8 +160,8 @@ def _dspace(fields: Mapping[str, Any], path: Path) -> Iterator[_Signal]:
 
 
 def read_structures(
-    path: Path, digest: str, groups: Mapping[str, list[_Signal]], layout: Mapping[str, str], rate_hz: float | None,
-    gaps: GapPolicy, kind: str, beside: Mapping[str, tuple[float, str | None]],
+    path: Path, provenance: Mapping[str, str], groups: Mapping[str, list[_Signal]], layout: Mapping[str, str],
+    rate_hz: float | None, gaps: GapPolicy, kind: str, beside: Mapping[str, tuple[float, str | None]],
 ) -> Record:  # fmt: skip
     """Make a record of the signals of one group."""
     group = chosen_group(path, {k: [s.name for s in v] for k, v in groups.items()}, layout.get("group"))
@@ -186,7 +186,7 @@ def read_structures(
         time = np.asarray(clocks[0].time, dtype=np.float64)
         unit = frozenset({clocks[0].time_unit})
         streams.append(Stream(name="time", size=time.size, pieces=lambda: (time,), time=True, units=unit))
-    return record_of(path, digest, streams, {"format": kind, "group": group, **told}, layout, rate_hz, gaps)
+    return record_of(path, provenance, streams, {"format": kind, "group": group, **told}, layout, rate_hz, gaps)
 
 
 def _timed(

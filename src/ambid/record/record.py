@@ -17,6 +17,7 @@ from html import escape
 from importlib import import_module
 from numbers import Real
 from pathlib import Path
+from threading import Thread
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, BinaryIO, overload
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
+_LONG = 1 << 20  # bytes from which the check value of a file is computed beside what follows its reading
 INSIDE: list[Path] = []  # of this process: folders in one of which what is read has to lie; without any, anywhere
 
 
@@ -414,6 +416,37 @@ def _similar(path: Path) -> str:
         return f" (nor does its folder {path.parent})"
     near = difflib.get_close_matches(path.name, names, n=1)
     return f" ({near[0]} does)" if near else ""
+
+
+class Provenance(Mapping[str, str]):
+    """Where a record comes from; the SHA-256 of a long file is computed meanwhile, and waited for where it is asked."""
+
+    def __init__(self, known: Mapping[str, str], data: bytes) -> None:
+        """`known`: all but ``sha256``, which is that of `data`."""
+        self._known, self._worker = dict(known), Thread(target=self._hash, args=(data,))
+        self._worker.start()
+
+    def _hash(self, data: bytes) -> None:
+        self._known["sha256"] = sha256_of(data)
+
+    def __getitem__(self, key: str) -> str:
+        self._worker.join()
+        return self._known[key]
+
+    def __iter__(self) -> Iterator[str]:
+        self._worker.join()
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        self._worker.join()
+        return len(self._known)
+
+
+def provenance_of(path: Path, data: bytes) -> Mapping[str, str]:
+    """Return name and SHA-256 of a file."""
+    if len(data) < _LONG:
+        return MappingProxyType({"file": path.name, "sha256": sha256_of(data)})
+    return Provenance({"file": path.name}, data)
 
 
 def sha256_of(data: bytes) -> str:

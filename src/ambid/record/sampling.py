@@ -120,7 +120,7 @@ def _record(table: Table, values: Array, rate_hz: float, start_s: float, steps: 
         start_s=start_s,
         channels=channels,
         history=(Step(name="read", settings=MappingProxyType(dict(table.settings))), *steps),
-        provenance=MappingProxyType(dict(table.provenance)),
+        provenance=MappingProxyType(table.provenance) if isinstance(table.provenance, dict) else table.provenance,
     )
 
 
@@ -136,8 +136,11 @@ def column_channel(name: str, unit_text: str | None, raw: Array) -> Channel:
 
 def refuse_gaps(table: Table) -> None:
     """Refuse values that are not finite, naming the first."""
-    if all(np.isfinite(column).all() for column in table.values.T):  # by columns: long ones leave no room for a mask
-        return
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # a sum takes no room; where it is not finite each value is looked at
+        if all(np.isfinite(column.sum()) or np.isfinite(column).all() for column in table.values.T):
+            return
     row, j = np.argwhere(~np.isfinite(table.values))[0]
     raise RecordError(
         f"{table.where}, row {table.first_row + row}, column {table.names[j]!r}: {table.values[row, j]} is not a"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -88,8 +88,8 @@ def chosen_group(path: Path, groups: Mapping[str, Sequence[str]], wanted: str | 
 
 
 def record_of(
-    path: Path, digest: str, streams: Sequence[Stream], settings: Mapping[str, object], layout: Mapping[str, str],
-    rate_hz: float | None, gaps: GapPolicy,
+    path: Path, provenance: Mapping[str, str], streams: Sequence[Stream], settings: Mapping[str, object],
+    layout: Mapping[str, str], rate_hz: float | None, gaps: GapPolicy,
 ) -> Record:  # fmt: skip
     """Read the columns of a file that are wanted, by default all, into a record."""
     streams = _wanted(path, streams, layout)
@@ -106,7 +106,6 @@ def record_of(
             )
     n = streams[0].size
     refuse_claim(path, n, len(streams), path.stat().st_size)
-    provenance = {"file": path.name, "sha256": digest}
     data = [s for s in streams if not s.time]
     if not data:
         raise RecordError(f"record {path} has a time column and nothing else; a record needs a channel. Add a column")
@@ -123,28 +122,31 @@ def record_of(
         else:
             data.append(Stream(name=clock.name, units=frozenset("s"), size=n, pieces=lambda x=stamps: (x,), time=True))  # type: ignore[misc]
     units = [_unit_of(s, path) for s in data]
-    values = np.empty((len(data), n)).T  # each column in one piece
-    for j, (stream, (unit, _)) in enumerate(zip(data, units, strict=True)):
-        _fill(values[:, j], stream, unit, path)
-    values.flags.writeable = False  # so that the channels are views of it
+    columns = [_column(stream, unit, path) for stream, (unit, _) in zip(data, units, strict=True)]
     table = Table(
-        where=str(path), names=tuple(s.name for s in data), values=values, first_row=1,
-        time=next((j for j, s in enumerate(data) if s.time), None),
-    )  # fmt: skip
-    if gaps == "error":
-        refuse_gaps(table)
-    end = sample_uniformly(table, rate_hz if rate is None else rate, gaps)
+        where=str(path), names=tuple(s.name for s in data), values=columns[0][:, None], first_row=1, time=None
+    )
+    steps: tuple[Step, ...] = ()
+    if gaps == "error":  # columns stay where they are
+        for stream, x in zip(data, columns, strict=True):
+            refuse_gaps(replace(table, names=(stream.name,), values=x[:, None]))
+        end = sample_uniformly(table, rate_hz if rate is None else rate, gaps)
+    else:
+        clocked = next((j for j, s in enumerate(data) if s.time), None)
+        table = replace(table, values=np.column_stack(columns), time=clocked)
+        end = sample_uniformly(table, rate_hz if rate is None else rate, gaps)
+        columns, steps = list(end.values.T), end.steps
     channels = tuple(
-        Channel(name=s.name, unit=unit.si if unit else UNKNOWN, values=end.values[:, j], source_unit=text)
-        for j, (s, (unit, text)) in enumerate(zip(data, units, strict=True))
+        Channel(name=s.name, unit=unit.si if unit else UNKNOWN, values=x, source_unit=text)
+        for s, x, (unit, text) in zip(data, columns, units, strict=True)
         if not s.time
     )
     read = Step(
         name="read", settings=MappingProxyType({**settings, "rows": n} | ({"layout": dict(layout)} if layout else {}))
     )
     return Record(
-        rate_hz=end.rate_hz, start_s=start_s + end.start_s, channels=channels, history=(read, *end.steps),
-        provenance=MappingProxyType(provenance | ({"taken_at": date} if date else {})),
+        rate_hz=end.rate_hz, start_s=start_s + end.start_s, channels=channels, history=(read, *steps),
+        provenance=MappingProxyType({**provenance, "taken_at": date}) if date else provenance,
     )  # fmt: skip
 
 
@@ -185,29 +187,36 @@ def _unit_of(stream: Stream, path: Path) -> tuple[Unit | None, str]:
         )
     text = next(iter(texts), UNKNOWN)
     unit = unit_or_none(text)
-    return (
-        (None, text) if unit is None or text == "g" else (unit, unit.symbol)
-    )  # of instruments: gravity rather than gram
+    gravity = text == "g"  # of instruments, rather than gram
+    return (None, text) if unit is None or gravity else (unit, unit.symbol)
 
 
-def _fill(out: Array, stream: Stream, unit: Unit | None, path: Path) -> None:
-    """Read a column, in SI where the unit is known."""
-    at = 0
+def _column(stream: Stream, unit: Unit | None, path: Path) -> Array:
+    """Read a column, read-only, in SI where the unit is known; one that is so already is not copied."""
+    out, at = np.empty(0), 0
     for piece in stream.pieces():
         values = numbers(f"record {path}", stream.name, piece, time=False)
+        values = values if unit is None else unit.to_si(values)
+        if values.size == stream.size and not at:
+            out, at = np.ascontiguousarray(values), values.size
+            continue
+        out = np.empty(stream.size) if not at else out
         part = out[at : at + values.size]
-        part[:] = (values if unit is None else unit.to_si(values))[: part.size]
+        part[:] = values[: part.size]
         at += values.size
-    if at != out.size:
+    if at != stream.size:
         raise RecordError(
-            f"record {path}: channel {stream.name!r} has {at} of the {out.size} samples that the file announces: it is "
-            "cut off or damaged. Copy it again"
+            f"record {path}: channel {stream.name!r} has {at} of the {stream.size} samples that the file announces: it "
+            "is cut off or damaged. Copy it again"
         )
+    out.flags.writeable = False
+    return out
 
 
 def _stamps(clock: Stream, path: Path) -> tuple[Array, str]:
     """Return time in s, and the date of the first stamp where they are dates."""
-    raw = np.concatenate([np.asarray(x) for x in clock.pieces()])
+    parts = [np.asarray(x) for x in clock.pieces()]
+    raw = parts[0] if len(parts) == 1 else np.concatenate(parts)
     if raw.size != clock.size:
         raise RecordError(
             f"record {path}: {clock.name!r} has {raw.size} of the {clock.size} samples that the file announces: it is "

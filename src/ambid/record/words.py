@@ -64,6 +64,7 @@ def symbol(text: str) -> str:
     return _SYMBOLS.get(plain.lower(), plain)
 
 
+@lru_cache(maxsize=1024)
 def unit_or_none(text: str | None) -> Unit | None:
     """Return the unit that a text names; None where it names none."""
     try:
