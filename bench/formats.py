@@ -1,4 +1,5 @@
-"""Memory and time of reading a long record from TDMS and MDF, each read in a process of its own.
+"""Memory and time of reading a long record from TDMS and MDF, each read in a process of its own; structures of MATLAB
+beside scipy.io.loadmat alone, and CSV beside numpy.loadtxt, in turn in one process.
 
 python bench/formats.py [SAMPLES]
 """
@@ -62,7 +63,47 @@ def write_mdf(path: Path, n: int) -> np.ndarray:
     return values[:, -1]
 
 
+def beside(n: int = 200_000, rounds: int = 15) -> None:
+    """Print the time of reading MATLAB and CSV over that of the bare library, the least of rounds in turn."""
+    from scipy.io import loadmat, savemat
+
+    from ambid.record import read_record
+
+    t, data = np.arange(n) / RATE_HZ, np.random.default_rng(1).standard_normal((7, n))
+    series = {name: {"Time": t, "Data": x, "Name": name} for name, x in zip(STREAMS, data, strict=False)}
+    signals = np.array(
+        [(x, name) for name, x in zip(STREAMS, data, strict=False)], dtype=[("values", "O"), ("label", "O")]
+    )
+    axis = np.array([("t", t)], dtype=[("Name", "O"), ("Data", "O")])
+    measured = np.array(list(zip(STREAMS, data, strict=False)), dtype=[("Name", "O"), ("Data", "O")])
+    contents = {
+        "Simulink": {"log": {"time": t, "signals": signals}}, "timeseries": {"logsout": series},
+        "dSPACE": {"rec": {"X": axis, "Y": measured}}, "columns": {"run": {"time": t, "u": data[0], "i": data[1]}},
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        pairs = {}
+        for name, content in contents.items():
+            path = Path(folder) / f"{name}.mat"
+            savemat(path, content)
+            pairs[path] = loadmat
+        table = Path(folder) / "eight columns.csv"
+        head = ",".join(["time [s]", *(f"c{k} [V]" for k in range(7))])
+        np.savetxt(table, np.column_stack([t, data.T]), delimiter=",", header=head, comments="", fmt="%.9g")
+        pairs[table] = lambda path: np.loadtxt(path, delimiter=",", skiprows=1)
+        for path, bare in pairs.items():
+            seconds = []
+            for _ in range(rounds if path.suffix == ".mat" else 3):
+                begin = time.perf_counter()
+                bare(path)
+                middle = time.perf_counter()
+                read_record(path)
+                seconds.append((time.perf_counter() - middle, middle - begin))
+            ours, alone = np.min(seconds, axis=0)
+            print(f"{path.name}: {ours * 1e3:.1f} ms, bare library {alone * 1e3:.1f} ms, ratio {ours / alone:.2f}")
+
+
 def main(n: int) -> None:
+    beside()
     print(f"{n} samples x {len(STREAMS)} streams, {8e-6 * n * len(STREAMS):.0f} MB of values")
     with tempfile.TemporaryDirectory() as folder:
         for name, write in (("long.tdms", write_tdms), ("long.mf4", write_mdf)):
