@@ -199,11 +199,12 @@ def identify_axis(
 
 
 def _with_facts(refusal: str, bench: Record, rig: Rig) -> str:
-    """Put what the record says by itself before a refusal, whose guess may be wrong then."""
+    """Put what the means say before a refusal, whose guess may be wrong then."""
     from ambid.validation.facts import facts
 
-    against = [c.detail for c in facts(bench, rig).values() if not c.passed]
-    return f"{'; '.join(against)}. Further: {refusal}" if against else refusal
+    with np.errstate(all="ignore"):  # of values that no sensor shows
+        means = facts(bench, rig).get("ohm")
+    return refusal if means is None or means.passed else f"{means.detail}. Further: {refusal}"
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
