@@ -22,20 +22,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambid.console.envelope import EnvelopeTap, rounded, throttled
+from ambid.console import views
+from ambid.console.envelope import EnvelopeTap, throttled
 from ambid.console.feed import FeedWriter
 from ambid.console.folder import Folder, plain
 from ambid.console.orders import LATE, Desk, Order
 from ambid.console.runs import MOVING, Heard, Run, size_of, usual_times
 from ambid.console.words import PAGE_WORDS, RIG_WORDS
 from ambid.errors import AmbidError
-from ambid.estimation.result import NORMAL_95
 from ambid.record.record import INSIDE
 from ambid.settings.caller import speaking
 
 if TYPE_CHECKING:
     from ambid.acquisition.session import Recording
-    from ambid.ledger import History, Series
     from ambid.recursive.lines import Event
     from ambid.tracking.lines_file import LiveState
 
@@ -43,9 +42,7 @@ _LISTEN_S = 0.02
 _BEAT_S = 0.5  # between two signs of life
 _LINE_S = 0.1  # between two lines of parameters that are shown
 _FLAGS = ("track", "hold", "accept", "revert")
-_PREVIEW = 800  # envelopes of a channel in a preview
 _LONGEST_S = 86_400.0
-_MOST_ESTIMATES = 2000  # of a history, the latest, that are drawn
 
 
 class Worker:
@@ -178,6 +175,12 @@ class Worker:
             raise AmbidError(f"{name} is no plain file of the folder any more. Choose another one")
         return found
 
+    def named(self, key: str) -> Path:
+        """Return a file that the spec has to name."""
+        found = self.path(key)
+        assert found is not None
+        return found
+
     def give(self, result: Any) -> str:
         """Write a result under its name, or the next that is free, and tell it; the name."""
         from ambid.job.presentation import content
@@ -281,47 +284,15 @@ def _reading(worker: Worker) -> dict[str, Any]:
 
 
 def _preview(worker: Worker) -> None:
-    """Tell what a record holds, and draft its rig."""
-    from ambid.console.look import look
-    from ambid.job.drafting import draft, guess
-    from ambid.job.presentation import content
-    from ambid.record import read_record
-    from ambid.validation.inspection import inspect
-
-    path = worker.path("record")
-    assert path is not None
-    how = _reading(worker)
-    record = read_record(path, **how)
-    worker.tick("channels")
-    step = max(1, -(-record.n_samples // _PREVIEW))
-    starts = np.arange(0, record.n_samples, step)
-    channels = [
-        {"name": c.name, "unit": c.unit, "low": rounded(np.minimum.reduceat(c.values, starts)),
-         "high": rounded(np.maximum.reduceat(c.values, starts))}
-        for c in record.channels
-    ]  # fmt: skip
-    worker.feed.tell("look", {**look(record), "limits": {}}, sticky="look")
-    worker.tick("diagnostics")
-    try:
-        drafted = draft(record, first=True, **how).text
-    except AmbidError as refusal:
-        drafted = ""
-        worker.note(str(refusal))
-    worker.feed.tell(
-        "preview",
-        {"channels": channels, "t": rounded(record.start_s + starts / record.rate_hz), "rate_hz": record.rate_hz,
-         "samples": record.n_samples, "draft": drafted, "content": content(inspect(record, guess=guess(record)))},
-        sticky="preview",
-    )  # fmt: skip
+    for kind, shown in views.preview(worker.named("record"), _reading(worker), tick=worker.tick, note=worker.note):
+        worker.feed.tell(kind, shown, sticky=kind)
 
 
 def _result(worker: Worker) -> None:
-    """Tell what a result says."""
     from ambid.job.presentation import content
     from ambid.job.results import load
 
-    path = worker.path("estimate")
-    assert path is not None
+    path = worker.named("estimate")
     worker.feed.tell("result", {"name": path.stem, "content": content(load(path))}, sticky="result")
 
 
@@ -331,14 +302,19 @@ def _look(worker: Worker) -> None:
     from ambid.record import read_record
     from ambid.rig import load_rig
 
-    path, rig = worker.path("record"), worker.path("rig")
-    assert path is not None
+    rig = worker.path("rig")
     asked = {
         k: worker.spec[k] for k in ("from_s", "to_s", "from_hz", "to_hz", "weights", "channel") if k in worker.spec
     }
     pair = [worker.spec[k] for k in ("across", "up") if k in worker.spec]
     lines = {} if rig is None else limits(load_rig(rig), columns=True)
-    worker.feed.tell("look", {**look(read_record(path, **_reading(worker)), orbit=pair, **asked), "limits": lines})
+    record = read_record(worker.named("record"), **_reading(worker))
+    worker.feed.tell("look", {**look(record, orbit=pair, **asked), "limits": lines})
+
+
+def _history(worker: Worker) -> None:
+    for kind, shown in views.bearings(worker.named("ledger"), worker.spec.get("bearing"), worker.tick):
+        worker.feed.tell(kind, shown)
 
 
 def _rig(worker: Worker) -> None:
@@ -355,7 +331,7 @@ def _rig(worker: Worker) -> None:
 def _identify(worker: Worker) -> None:
     from ambid.job import identify
 
-    found = identify(worker.path("record"), worker.path("rig"), tick=worker.tick)  # type: ignore[arg-type]
+    found = identify(worker.named("record"), worker.named("rig"), tick=worker.tick)
     worker.draw(found, worker.give(found))
 
 
@@ -371,8 +347,7 @@ def _design(worker: Worker) -> None:
     from ambid.job import design_controller
     from ambid.rig import rig_text
 
-    estimate = worker.path("estimate")
-    assert estimate is not None
+    estimate = worker.named("estimate")
     found = design_controller(estimate, worker.path("rig"), method=worker.spec.get("method", "pid"), tick=worker.tick)
     name = worker.give(found)
     with (worker.folder / f"{name}.toml").open("x", encoding="utf-8") as file:
@@ -385,8 +360,7 @@ def _export(worker: Worker) -> None:
     from ambid.record import read_record, write_record
     from ambid.record.record import cut
 
-    path, out = worker.path("record"), worker.folder / str(worker.spec["out"])
-    assert path is not None
+    path, out = worker.named("record"), worker.folder / str(worker.spec["out"])
     record = cut(read_record(path, gaps="interpolate"), float(worker.spec["from_s"]), float(worker.spec["to_s"]))
     if out.exists():
         raise AmbidError(f"{out.name} already exists. Choose another name")
@@ -630,55 +604,9 @@ def _commission(worker: Worker) -> None:
             raise KeyboardInterrupt
 
 
-def _history(worker: Worker) -> None:
-    """Tell which bearings a ledger has, and one of them over time: that which is asked for, else the first."""
-    from ambid.ledger import open_ledger
-
-    path = worker.path("ledger")
-    assert path is not None
-    with open_ledger(path, write=False) as ledger:
-        known = ledger.bearings()
-        failed = [{"bearing": f.bearing, "record": f.record, "reason": f.reason} for f in ledger.failures().values()]
-        names = [b.name for b in known]
-        worker.feed.tell("bearings", {"names": names, "failed": failed[-50:], "failures": len(failed)})
-        worker.tick("history")
-        if names:
-            worker.feed.tell("history", drawn(ledger.history(worker.spec.get("bearing", names[0]))))
-
-
-def drawn(found: History) -> Mapping[str, Any]:
-    """Return verdict, series, estimates and events of a history; of a long one the latest."""
-    from ambid.job.presentation import content
-
-    first = max(0, len(found.estimates) - _MOST_ESTIMATES)
-    asked = ("taken_at", "record", "job", "status", "verdict", "failed", "version")
-    return {
-        "bearing": found.bearing, "plant": found.plant, "content": content(found), "left_out": first,
-        "estimates": [{k: getattr(e, k) for k in asked} for e in found.estimates[first:]],
-        "series": {name: _series(found, name, s, first) for name, s in found.measured.items()},
-        "events": [{k: getattr(e, k) for k in ("at", "kind", "text", "parameter")} for e in found.events],
-    }  # fmt: skip
-
-
-def _series(found: History, name: str, s: Series, first: int) -> Mapping[str, Any]:
-    """Return one series; `verdict`: of each estimate, or that its record did not show this number."""
-    from ambid.console.look import meanings
-
-    of = s.estimate >= first
-    said = zip(s.estimate[of], s.identifiable[of], strict=True)
-    return {
-        "unit": s.unit, "meaning": meanings(found.plant).get(name, ""),
-        "t": s.taken_at[of].tolist(), "value": rounded(s.value[of], 9),
-        "sd": rounded(s.sd[of]), "half": rounded(NORMAL_95 * s.sd[of]),
-        "verdict": [found.estimates[k].verdict if seen else "hidden" for k, seen in said],
-        "known": int(np.count_nonzero(np.isfinite(s.value))),
-    }  # fmt: skip
-
-
 JOBS: Mapping[str, Callable[[Worker], None]] = {
     "preview": _preview, "look": _look, "result": _result, "rig": _rig, "identify": _identify, "margins": _margins,
-    "design": _design,
-    "export": _export, "history": _history, "live": _live, "commission": _commission,
+    "design": _design, "export": _export, "history": _history, "live": _live, "commission": _commission,
 }  # fmt: skip
 
 
