@@ -14,6 +14,10 @@ from tests.console.pages import LIVE, console, over, prototype_rig, until
 
 pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 pytestmark = NEEDED
+# what is written in the pictures
+WORDS = """(() => { const draw = CanvasRenderingContext2D.prototype.fillText; window.words = [];
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...where) { words.push(text);
+    return draw.call(this, text, ...where); }; })()"""
 RATE, HZ, SIZE_M, SIZE_A = 2000.0, 4.0, 1e-4, 0.3
 IDLE = "!document.querySelector('#detail progress')"
 # what a chart's button would save, as text; the last one
@@ -275,11 +279,7 @@ def test_records_lie_over_each_other_from_their_starts(page, folder, tmp_path):
 
 def test_limits_of_a_rig_are_drawn_in_the_units_of_the_record(page, folder):
     shown(page, "sine.csv", 4)
-    page.evaluate(
-        "(() => { const draw = CanvasRenderingContext2D.prototype.fillText; window.words = []; "
-        "CanvasRenderingContext2D.prototype.fillText = function (text, ...where) "
-        "{ words.push(text); return draw.call(this, text, ...where); }; })()"
-    )
+    page.evaluate(WORDS)
     choose(page, "metres.toml")
     page.until("words.some((w) => w.includes('trip'))", 60.0)
     assert {"↑ trip 900.0 µm", "↓ trip -900.0 µm", "↑ limit of the coil 1.000 A"} <= set(page.evaluate("words"))
@@ -295,6 +295,30 @@ def choose(page, text):
     )
 
 
+def live_plots_are_read(page):
+    """Cursors in a picture that stands still, marks with their words, limits and meanings."""
+    page.evaluate(WORDS)
+    page.put("#span", "5 min")
+    page.click("#freeze")
+    page.evaluate("feed.redraw()")
+    page.until("words.some((w) => w.startsWith('limit: position passed'))")
+    assert {"↑ trip 900.0 µm", "↑ limit of the amplifier 11.40 V"} <= set(page.evaluate("words"))
+    box = "document.querySelector('#strips .u-over').getBoundingClientRect()"
+    left, top, width = page.evaluate(f"[{box}.left, {box}.top, {box}.width]")
+    for share in (0.4, 0.6):
+        for kind in ("mousePressed", "mouseReleased"):
+            mouse(page, kind, left + share * width, top + 30)
+    text = page.until("(document.querySelector('#strips .cursors').innerText.match(/.*Δt.*/) ?? [''])[0]")
+    a, b = (float(x) for x in re.findall(r"[AB] ([\d.]+) s", text))
+    span = page.evaluate("[feed.strips[0].plot.scales.x.min, feed.strips[0].plot.scales.x.max]")
+    assert b - a == pytest.approx(0.2 * (span[1] - span[0]), abs=0.05)
+    assert "± " in page.text("#parameters .chart .cursors")
+    assert page.evaluate("document.querySelector('#parameters h3').title") == "mass of the rotor on this axis"
+    page.evaluate("document.querySelector('#spectrum details').open = true")
+    page.until("feed.fall.plot.data[0].length > 1")
+    page.click("#freeze")
+
+
 def test_alarms_are_filtered_and_acknowledged_for_all_pages_and_stay(browser, folder):
     run = Runs(folder).start({**LIVE, "out": "alarms.h5"})
     assert until(run, "line")
@@ -305,6 +329,7 @@ def test_alarms_are_filtered_and_acknowledged_for_all_pages_and_stay(browser, fo
             page.evaluate("feed.event(1.5, 'limit', 'position passed 0.0009 m: trip')")  # as the run tells it
             page.with_text("#events li", "limit: position passed")
             assert page.text(".alarms [role=status]") == "1 not acknowledged"
+        live_plots_are_read(first)
         first.put(".alarms select", "alarms")
         assert first.evaluate(
             "[...document.querySelectorAll('#events li')].every((l) => l.textContent.includes('limit'))"

@@ -93,9 +93,8 @@ class FeedWriter:
                 frame = _framed(b"J", json.dumps(note).encode()) + frame
             if not at:
                 known = [_json_frame(kind, content()) for kind, content in self._states.items()]  # before any line
-                if self._events:
-                    known.append(_json_frame("before", {"events": list(self._events)}))
                 known += [f for f in self._sticky.values() if not frame.endswith(f)]
+                known += [_json_frame("before", {"events": list(self._events)})] if self._events else []
                 frame = b"".join((*known, frame))
             if file.write(frame) < len(frame):
                 file.truncate(file.seek(at))

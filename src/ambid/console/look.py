@@ -21,7 +21,7 @@ _BINS = 1600  # envelopes of a channel: fewer samples are shown as they are
 _LINES = 1200  # of a spectrum
 _COLUMNS, _ROWS = 120, 200  # of a waterfall
 _LONGEST_S = 1.0  # of samples that a column of a waterfall is made of
-_ORBIT = 3000  # samples, the last ones
+_ORBIT, _SPECTRUM = 3000, 1 << 21  # samples, the last ones
 _WORDS = {"voltage": "limit of the amplifier", "current": "limit of the coil", "position": "the rotor touches"}
 _TURNS = {"rad/s": 1.0 / (2.0 * np.pi), "Hz": 1.0}  # to turns a second
 
@@ -42,7 +42,8 @@ def look(
     starts = np.arange(0, part.n_samples, max(1, -(-part.n_samples // _BINS)))
     low, high = np.minimum.reduceat(signals, starts, axis=1), np.maximum.reduceat(signals, starts, axis=1)
     k = names.index(channel) if channel in names else 0
-    hz, amplitudes = spectrum(signals, part.rate_hz, lines=_LINES, band=band, weights=weights)
+    last = signals[:, -_SPECTRUM:]
+    hz, amplitudes = spectrum(last, part.rate_hz, lines=_LINES, band=band, weights=weights)
     turning = _turning(part)
     pair = [n for n in orbit if n in names] or [c.name for c in part.channels if c.unit == "m"][:2]
     return {
@@ -52,7 +53,8 @@ def look(
         "channels": [{"name": c.name, "unit": c.unit, "low": rounded(a, 7), "high": rounded(b, 7)}
                      for c, a, b in zip(part.channels, low, high, strict=True)],
         "spectrum": {"hz": rounded(hz, 8), "amplitudes": [rounded(a) for a in amplitudes], "weights": weights,
-                     "resolution": WINDOWS[weights][1] * part.rate_hz / part.n_samples},
+                     "resolution": WINDOWS[weights][1] * part.rate_hz / last.shape[1],
+                     "seconds": last.shape[1] / part.rate_hz if last.shape[1] < part.n_samples else None},
         "waterfall": {"name": names[k], "unit": part.channels[k].unit,
                       **_waterfall(signals[k], part, band, turning, weights)},
         "turning": None if turning is None else rounded(np.array([turning.min(), turning.max()])),

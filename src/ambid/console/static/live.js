@@ -22,7 +22,7 @@ export class Live extends Watched {
     Object.assign(this, { signals: null, header: null, strips: [], parameters: {}, frozen: false, following: false, marked: null,
       record: null, wanted: run.spec.seconds ?? Infinity });
     this.zoom = null; narrow();
-    this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
+    this.t = []; this.seconds = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
     $("live-view").hidden = false; $("live-hint").hidden = true;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
     this.alarms = new Alarms(run, $("events"));
@@ -38,7 +38,7 @@ export class Live extends Watched {
   }
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; },
-      header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
+      header: () => this.start(m), line: () => this.take(m), spectrum: () => this.hear(m),
       event: () => this.event(m.t, m.what, m.why), alarm: () => this.event(m.t, m.what, m.why),
       told: () => m.events.forEach((e) => this.event(e.t, e.what, e.why)), before: () => m.events.forEach((e) => this.tell(e)),
       device: () => this.event(m.sample === null ? null : m.sample / (this.signals?.rate_hz ?? NaN), m.what, m.text),
@@ -67,7 +67,7 @@ export class Live extends Watched {
     const signals = m.names.map((name, k) => ({ name, unit: m.units[k] })), choice = el("select", { ariaLabel: "signal of the waterfall" },
       ...m.names.map((n, k) => el("option", { value: k, selected: n.endsWith("position") }, n)));
     this.spectra = new Spectra($("spectrum"), signals, { group: new Group({ unit: "Hz", log: true }), turns, height: 130 });
-    this.fall = waterfall("Waterfall", 190, { group: new Group(), turns, log: true }); this.seconds = [];
+    this.fall = waterfall("Waterfall", 190, { group: new Group(), turns, log: true });
     this.open = el("details", { ontoggle: () => this.drawFall() }, el("summary", {}, "Waterfall of the last two minutes"), choice,
       this.fall.box);
     choice.onchange = () => this.drawFall(); this.fallOf = choice;
@@ -204,11 +204,14 @@ export class Live extends Watched {
     this.lags.push(Date.now() / 1000 - this.fresh); if (this.lags.length > 2000) this.lags.shift();
     this.updates = (this.updates ?? 0) + 1;
   }
+  hear(m) {
+    this.spectrum = m;
+    this.seconds.push({ t: this.t.at(-1) ?? 0, ...m });
+    if (this.seconds.length > 120) this.seconds.shift();
+  }
   drawSpectrum() {
     const words = `Hann window, resolution ${shown(this.signals.resolution, "Hz")}`;
     this.spectra.show({ ...this.spectrum, words });
-    this.seconds.push({ t: this.t.at(-1) ?? 0, ...this.spectrum });
-    if (this.seconds.length > 120) this.seconds.shift();
     this.spectrum = null;
     this.drawFall();
   }

@@ -72,8 +72,9 @@ export function recordView(file, host, how = {}) {
     const [first] = looks, w = first.waterfall, fast = over.value === "rpm" && w.turning;
     const key = JSON.stringify([mode.value, over.value, looks.map((l) => [l.file, l.channels.map((c) => [c.name, c.unit])])]);
     if (key !== shape) build(key);
-    const { lists, spectra, fall, ring } = drawn, of = (s) =>
-      `${s.weights ?? weights.value} window, resolution ${shown(s.resolution, "Hz")}`;
+    const { lists, spectra, fall, ring } = drawn;
+    const of = (s) => `${weights.value} window, resolution ${shown(s.resolution, "Hz")}`
+      + (s.seconds ? `, of the last ${seconds(s.seconds)}` : "");
     for (const { made, parts } of lists) {
       const tables = parts.map(([l, c]) => {
         const { t, channels } = looks[l], zero = begin(looks[l]);
