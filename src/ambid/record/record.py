@@ -17,7 +17,6 @@ from html import escape
 from importlib import import_module
 from numbers import Real
 from pathlib import Path
-from threading import Thread
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, BinaryIO, overload
 
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
-_LONG = 1 << 20  # bytes from which the check value of a file is computed beside what follows its reading
+_LONG, _LONGEST = 1 << 20, 1 << 28  # bytes of a file between which its check value waits until it is asked
 INSIDE: list[Path] = []  # of this process: folders in one of which what is read has to lie; without any, anywhere
 
 
@@ -419,32 +418,30 @@ def _similar(path: Path) -> str:
 
 
 class Provenance(Mapping[str, str]):
-    """Where a record comes from; the SHA-256 of a long file is computed meanwhile, and waited for where it is asked."""
+    """Where a record comes from; the SHA-256 of its file, longer to compute than to read, is so where it is asked."""
 
     def __init__(self, known: Mapping[str, str], data: bytes) -> None:
         """`known`: all but ``sha256``, which is that of `data`."""
-        self._known, self._worker = dict(known), Thread(target=self._hash, args=(data,))
-        self._worker.start()
+        self._known, self._data = dict(known), data
 
-    def _hash(self, data: bytes) -> None:
-        self._known["sha256"] = sha256_of(data)
+    def _all(self) -> dict[str, str]:
+        if "sha256" not in self._known:
+            self._known["sha256"], self._data = sha256_of(self._data), b""
+        return self._known
 
     def __getitem__(self, key: str) -> str:
-        self._worker.join()
-        return self._known[key]
+        return self._all()[key]
 
     def __iter__(self) -> Iterator[str]:
-        self._worker.join()
-        return iter(self._known)
+        return iter(self._all())
 
     def __len__(self) -> int:
-        self._worker.join()
-        return len(self._known)
+        return len(self._all())
 
 
 def provenance_of(path: Path, data: bytes) -> Mapping[str, str]:
     """Return name and SHA-256 of a file."""
-    if len(data) < _LONG:
+    if not _LONG <= len(data) < _LONGEST:
         return MappingProxyType({"file": path.name, "sha256": sha256_of(data)})
     return Provenance({"file": path.name}, data)
 
