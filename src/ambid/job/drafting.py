@@ -304,7 +304,7 @@ def _contradiction(found: _Trial, chosen: Mapping[str, Channel], units: Mapping[
             name = chosen[role].name
             return (
                 f"column {name!r} says [{said.symbol}], with which no bearing has such sizes; in [{unit}] they are "
-                f"usual. Say which: {setting('column', f'{role}={name} [{unit}]')}, or confirm [{said.symbol}] so"
+                f"usual. Say which: {setting('column', f'{role}={name} [{unit}]')}, or confirm it with [{said.symbol}]"
             )
     return ""
 

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 
 _FIRST = "Let 'ambid init' draft a rig of the record"
+_DRAFTED = " in the rig that 'ambid init' drafts"
 SELECTED = Step(name="select")
 """Says in the history of a record that its channels are named by role and calibrated."""
 
@@ -592,7 +593,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
                 f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
                 f" {choices(c.column, record.names)} {remedy}"
             )
-    found = {c.role: _in_declared_unit(record.channel(c.column), c) for c in rig.channels}
+    found = {c.role: _in_declared_unit(record.channel(c.column), c, drafting=rig.source is None) for c in rig.channels}
     _refuse_swapped(found, wanted, rig)
     channels, steps = [], []
     for c in rig.channels:
@@ -645,7 +646,7 @@ def _through_a_rig(record: Record, rig: Rig, wanted: Mapping[str, str]) -> Recor
     return record
 
 
-def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:
+def _in_declared_unit(channel: Channel, c: RigChannel, *, drafting: bool = False) -> Channel:
     """Apply channels.<role>.unit, which says in what unit the column was written, whatever its header says."""
     if c.unit is not None and c.unit != channel.source_unit:
         raw = channel.values
@@ -658,7 +659,7 @@ def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:
         what = f"is in [{channel.source_unit}], an unknown unit" if unknown else "has no unit"
         raise UnitError(
             f"column {channel.name!r} {what} (needed by channels.{c.role}). Write '{channel.name} [unit]' in the header"
-            f" ([1] for a plain number), or give channels.{c.role}.unit"
+            f" ([1] for a plain number), or give channels.{c.role}.unit{_DRAFTED if drafting else ''}"
         )
     return channel
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -76,6 +77,7 @@ def setting(name: str, value: object = None) -> str:
     if _language == "shell":
         if name == "closed" and value is not None:
             value = "closed" if value else "open"
+        value = shlex.quote(str(value)) if name == "column" and value is not None else value
         return flag(name) if value in (None, True) else f"{flag(name)} {value}"
     if _language == "console":
         label = _words.get(name) or f"{flag(name)} of the command"
@@ -84,7 +86,8 @@ def setting(name: str, value: object = None) -> str:
     if value is None or not name.isidentifier():
         return name
     if name in _BY_WORD and "=" in str(value):
-        return f"{name}={{{', '.join(_entry(word) for word in str(value).split())}}}"
+        words = [str(value)] if name == "column" else str(value).split()
+        return f"{name}={{{', '.join(map(_entry, words))}}}"
     return f"{name}={value}" if str(value).isupper() else f"{name}={value!r}"
 
 
