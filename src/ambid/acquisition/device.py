@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Literal, Protocol, Self
 
 from ambid.acquisition.law_words import LawWords
+from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.tracking.blocks import Frame
 
@@ -57,6 +58,20 @@ class Program:
     cycles: int = 0  # how often it is played; 0: until it is ended
     seed: int = 1  # start of the shift register
     table: tuple[int, ...] = ()  # elements, -127 to 127
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AxesProgram:
+    """An excitation of a rotor, added to the outputs of the controllers of all axes, period after period."""
+
+    kind: str
+    amplitude: float  # peak, in the unit of the inputs
+    wave: Array  # one period, (n_samples, n_axes)
+    unit: str = "V"
+
+    def __str__(self) -> str:
+        n, axes = self.wave.shape
+        return f"{self.kind} of {self.amplitude:.3g} {self.unit} on {axes} axes, {n} samples a period"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,22 +168,22 @@ class Device(Protocol):
         """
         ...
 
-    def excite(self, program: Program | None) -> None:
+    def excite(self, program: Program | AxesProgram | None) -> None:
         """Play an excitation from the next tick on, in place of one that is played; driving or levitating.
 
         Parameters
         ----------
-        program : Program or None
+        program : Program, AxesProgram or None
             None ends it; harmless where none is played.
         """
         ...
 
-    def load(self, program: Program) -> None:
+    def load(self, program: Program | AxesProgram) -> None:
         """Give the device an excitation beforehand, so that `excite` with the very same begins at once; none is played.
 
         Parameters
         ----------
-        program : Program
+        program : Program or AxesProgram
         """
         ...
 

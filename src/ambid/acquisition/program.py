@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ambid.acquisition.device import Program
+from ambid.acquisition.device import AxesProgram, Program
 from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import TABLE_LENGTH, scale_of, who
 from ambid.acquisition.settings import ControllerSettings
@@ -154,6 +154,13 @@ def _lowest(high: float, rate_hz: float) -> float:
     return rate_hz / (hold * TABLE_LENGTH)
 
 
+def of_one_axis(program: Program | AxesProgram) -> Program:
+    """Refuse a rotor's program where a controller drives one axis."""
+    if isinstance(program, AxesProgram):
+        raise DeviceError(f"{program}: this controller drives one axis. Give a Program")
+    return program
+
+
 def counts_of(program: Program, rig: Rig, settings: ControllerSettings) -> dict[str, int]:
     """Return the fields of the message ``excitation`` without ``id``, by the calibration of the rig's voltage."""
     amplitude = 0
@@ -238,7 +245,9 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
     return counts
 
 
-def period_ticks(program: Program) -> int:
+def period_ticks(program: Program | AxesProgram) -> int:
     """Return the period of an excitation in ticks; 0 where it has none."""
+    if isinstance(program, AxesProgram):
+        return len(program.wave)
     n = {"none": 0, "step": 2, "prbs": 2**program.length - 1, "table": program.length}[program.kind]
     return int(n) * program.hold

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquisition.device import Column, DeviceInfo, Program
+from ambid.acquisition.device import AxesProgram, Column, DeviceInfo, Program
 from ambid.acquisition.program import period_ticks
 from ambid.arrays import Array
 from ambid.errors import counted
@@ -218,13 +218,14 @@ class QualityReport:
 class Quality:
     """Judges a stream as it comes, of an opened device and the excitation that begins with it, if any."""
 
-    def __init__(self, info: DeviceInfo, program: Program | None = None) -> None:
+    def __init__(self, info: DeviceInfo, program: Program | AxesProgram | None = None) -> None:
         self._info, width = info, len(info.columns)
         self._moments, self._differences, self._rate = Moments(info.columns), Differences(width), Rate()
         period = period_ticks(program) if program is not None else 0
         self._excited = period > 0
         self._periods = Periods(width, period) if 0 < period <= _LONGEST_PERIOD else None
-        self._ends = period * program.cycles if program is not None and program.cycles else math.inf
+        cycles = program.cycles if isinstance(program, Program) else 0
+        self._ends = period * cycles if cycles else math.inf
         self._first: int | None = None
         self._next = 0
         self._whole = False  # whether the sample before the next one was there, and sound
@@ -360,7 +361,7 @@ def faults(report: QualityReport, info: DeviceInfo) -> tuple[Reason, ...]:
                 )
                 reasons.append(Reason(check="size", text=text, grave=True))
                 continue
-            sensed = column.role in MEASURED
+            sensed = column.role.rsplit("_", 1)[-1].rstrip("0123456789") in MEASURED  # of a rotor: of any of its axes
             reasons += [*_range(column), *_content(column, report)] if sensed else _ordered(column, report.excited)
     return tuple(reasons)
 

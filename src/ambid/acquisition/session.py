@@ -12,7 +12,7 @@ from typing import Protocol, TypedDict, Unpack
 
 import numpy as np
 
-from ambid.acquisition.device import Counters, Device, DeviceEvent, DeviceInfo, LawTrial, Mode, Program
+from ambid.acquisition.device import AxesProgram, Counters, Device, DeviceEvent, DeviceInfo, LawTrial, Mode, Program
 from ambid.acquisition.program import period_ticks
 from ambid.acquisition.quality import Quality, QualityReport
 from ambid.acquisition.recorder import JournalHeader, Recorded, Recorder
@@ -46,7 +46,7 @@ class Course:
     settle_s: float = 0.0  # time after the start that is not passed on: lift-off and its transient, s
     # excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
     # periodic from its first sample.
-    program: Program | None = None
+    program: Program | AxesProgram | None = None
     trial: LawTrial | None = None  # another law, tried and confirmed after the settling
     # pass on all of it, the settling too; `seconds` then count from the excitation's first sample on
     transient: bool = False
@@ -119,7 +119,8 @@ class _Run:
         self._wanted = max(1, round(course.seconds * rate_hz))
         self.report = RunReport(wanted=self._wanted)
         self._settling = round(course.settle_s * rate_hz)
-        self._excited = next((k for k, c in enumerate(device.info.columns) if c.role == "excitation"), None)
+        roles = [c.role for c in device.info.columns]  # of a rotor each axis has a reference
+        self._excited = [k for k, r in enumerate(roles) if r == "excitation" or r.endswith("_reference")]
         self._lead: int | None = None  # ticks of excitation that are still to pass before samples are passed on
         self._awaited = False  # whether the excitation is waited for, and what comes meanwhile is passed on
         self._unheard = 0
@@ -190,10 +191,10 @@ class _Run:
         report.after = max(report.after, part.first + len(part.values))
         return report.after >= end
 
-    def lead_in(self, program: Program, *, passed_on: bool) -> None:
+    def lead_in(self, program: Program | AxesProgram, *, passed_on: bool) -> None:
         """Let the excitation settle before samples are passed on; `passed_on`: wait for it, but pass all on."""
-        self._awaited = passed_on and self._excited is not None
-        if self._excited is not None and not passed_on:
+        self._awaited = passed_on and bool(self._excited)
+        if self._excited and not passed_on:
             self._lead = min(period_ticks(program), round(_LONGEST_LEAD_S * self._rate_hz))
 
     def _after_lead(self, block: Block) -> Block | None:
@@ -220,8 +221,7 @@ class _Run:
 
     def _begin(self, block: Block) -> int | None:
         """Return at which sample of a block the excitation is seen first; None where it is not."""
-        assert self._excited is not None
-        plays = np.flatnonzero(block.values[:, self._excited])
+        plays = np.flatnonzero(block.values[:, self._excited].any(axis=1))
         if plays.size:
             return int(plays[0])
         self._unheard += len(block.values)

@@ -507,7 +507,7 @@ class BenchView:
     def __init__(self, info: DeviceInfo, rig: Rig, roles: Sequence[str]) -> None:
         self.rate_hz = info.rate_hz
         self._columns, self._rig = info.columns, rig
-        late = [c.role for c in rig.channels if c.delay not in ("auto", 0) and c.role not in model(rig.model).inputs]
+        late = [c.role for c in rig.channels if c.delay not in ("auto", 0) and c.role not in rig.plant.inputs]
         if late:
             raise RigError(
                 f"channels.{late[0]}.delay is taken back in a whole record only; samples of a device come in blocks. "

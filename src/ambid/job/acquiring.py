@@ -9,7 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from ambid.acquisition.device import Device, Mode
+import numpy as np
+
+from ambid.acquisition.device import AxesProgram, Device, Mode
 from ambid.acquisition.review import refuse_unstable, review
 from ambid.acquisition.session import Acquired, Course, Progress
 from ambid.acquisition.session import acquire as record_course
@@ -20,13 +22,15 @@ from ambid.errors import AmbidError, DeviceError, counted
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import known_rig
 from ambid.job.results import experiment_of
-from ambid.job.simulation import bench_of_source
+from ambid.job.simulation import FRACTION, LEAST_PERIODS, bench_of_source, waves_of_axes
 from ambid.physics.presets import Preset
 from ambid.record.sampling import MIN_SAMPLES
 from ambid.rig import Rig
 from ambid.settings.caller import LARGEST, check_band, check_positive, check_whole, refuse_given, setting
+from ambid.simulation.rotor_bench import RotorBench
 
 _TRIAL_S = 2.0  # of each trial of an amplitude
+_PERIOD_S = 1.0  # of the excitation of a rotor, at most
 _SAME_RATE = 1e-3  # a rate from a time column is rounded
 
 Note = Callable[[str], object]
@@ -61,7 +65,7 @@ class Request:
         check_band(self.band)
         named = {"amplitude": self.amplitude, "band": self.band}
         _check_excitation(port, mode, self.excitation, named)
-        if (experiment := experiment_of(self.excitation)) is not None:
+        if (experiment := experiment_of(self.excitation)) is not None and rig.rotor is None:
             refuse_given(named, f"{setting('excitation')} is an experiment, which takes no {{}}. Omit {{}}")
             _ = experiment.program
         return Trial(
@@ -89,6 +93,8 @@ class Request:
             )
         if self.excitation is None:
             return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s)
+        if rig.rotor is not None:
+            return self._of_axes(rig, trial, rate_hz, note)
         if (experiment := experiment_of(self.excitation)) is not None:
             experiment.played(0, rate_hz, closed=trial.mode == "levitate")
             return Course(
@@ -112,6 +118,29 @@ class Request:
             raise
         note(f"amplitude {found:.3g} V, found by trials")
         return trial.course(found, rate_hz)
+
+    def _of_axes(self, rig: Rig, trial: Trial, rate_hz: float, note: Note) -> Course:
+        """Return the course of a rotor: an excitation of all axes, of periods of a second, at least four."""
+        bench, kind = RotorBench.of(rig, rate_hz, True), str(self.excitation)
+        if (experiment := experiment_of(self.excitation)) is not None:
+            wave, kind = experiment.played(experiment.period, rate_hz, closed=True), "experiment"
+        else:
+            if kind == "multisine":
+                kind = "zippered"
+                note("multisine: its lines are dealt out to the axes (zippered), so that each excites one")
+            if kind == "orthogonal":
+                raise AmbidError(f"{setting('excitation', kind)} is for several records. Give zippered")
+            period = round(min(_PERIOD_S, trial.seconds / LEAST_PERIODS) * rate_hz)
+            wave, _ = waves_of_axes(bench, kind, period, 1, None, self.band, self.seed)
+            peak = self.amplitude
+            if peak is None:
+                peak = bench.largest(np.tile(wave, (2, 1)), self.seed, FRACTION)
+                note(f"amplitude {peak:.3g} V, half of what the limits allow by the rig's own numbers")
+            wave = peak * wave
+        program = AxesProgram(
+            kind=kind, amplitude=float(np.abs(wave).max()), wave=wave, unit=bench.model.units[bench.model.inputs[0]]
+        )
+        return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s, program=program)
 
 
 def acquire(
@@ -268,18 +297,21 @@ def opened(
     from ambid.acquisition.devices import open_device
 
     behind, invented = None if bench is None else bench_of_source(bench), port in ("emulated", "simulated")
-    complete = with_default_daq(rig) if invented else rig
-    for line in default_daq_notes(rig) if invented and rig.rotor is None else ():
+    rotor = rig.rotor is not None
+    complete = with_default_daq(rig) if invented and not rotor else rig
+    for line in default_daq_notes(rig) if invented and not rotor else ():
         note(line)
     made = open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed)
-    if closes:
+    if closes and rotor:
+        RotorBench.of(rig, made.info.rate_hz, True).refuse_unstable()
+    elif closes:
         refuse_unstable(rig, made.info)
     with made as device:
-        notes = (
-            _replay_notes(device, rig)
-            if port.startswith("replay:")
-            else review(complete, controller_settings(complete), parameters=device.info.plant)
-        )
+        if port.startswith("replay:"):
+            notes = _replay_notes(device, rig)
+        else:
+            settings = None if rotor else controller_settings(complete)
+            notes = () if settings is None else review(complete, settings, parameters=device.info.plant)
         for line in notes:
             note(line)
         yield device
@@ -289,7 +321,7 @@ def _usual_mode(port: str, rig: Rig, excitation: object) -> Mode:
     """Choose what a device does where the user does not say."""
     if port.startswith("replay:"):
         return "sample"
-    if rig.loop is not None and rig.loop.closed and not rig.open_loop:
+    if rig.rotor is not None or (rig.loop is not None and rig.loop.closed and not rig.open_loop):
         return "levitate"
     return "sample" if excitation is None else "drive"
 

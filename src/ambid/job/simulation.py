@@ -39,9 +39,11 @@ from ambid.simulation.rotor_bench import RotorBench
 BenchSource = str | Path | Rig | Preset | Estimate | NonlinearBearingEstimate
 """Who has the numbers of a bench: a preset by name, a rig, an estimate of one axis, or a file of one of these."""
 
-_LEAST_PERIODS = 4  # of a rotor's record: their scatter is its noise
+LEAST_PERIODS = 4
+"""Periods of a rotor's record: their scatter is its noise."""
 _REACH = 10.0  # of the rate over the highest line of a rotor's excitation
-_FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
+FRACTION = 0.5
+"""Part of the limits that an amplitude chosen by the program uses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,9 +199,9 @@ def simulate_used(
         if log_excitation:
             raise AmbidError(_no_log())
         kind, held = str(excitation or "zippered"), 1 if settle is None else settle
-        shape, period = _of_axes(bench, kind, n, periods, axes, band, seed)
+        shape, period = waves_of_axes(bench, kind, n, periods, axes, band, seed)
         trial = shape[: 2 * period]  # begins at rest: what it needs is no less than later
-        peak = bench.largest(trial, seed, _FRACTION) if amplitude is None else amplitude
+        peak = bench.largest(trial, seed, FRACTION) if amplitude is None else amplitude
         before = np.tile(shape[:period], (held, 1))
         done = bench.simulate(peak * np.vstack([before, shape]), seed=seed, settle=held * period)
         return done, Excited(kind=kind, peak=peak, unit=bench.model.units[bench.model.inputs[0]])
@@ -209,7 +211,7 @@ def simulate_used(
     shape = _repeat(
         lambda part: make_excitation(kind, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods or 1
     )
-    peak = bench.largest(shape, seed, _FRACTION) if amplitude is None else amplitude
+    peak = bench.largest(shape, seed, FRACTION) if amplitude is None else amplitude
     done = bench.simulate(peak * shape, seed=seed)
     return _with_excitation(done, peak * shape if log_excitation else None), Excited(kind=kind, peak=peak)
 
@@ -222,7 +224,7 @@ def _with_excitation(done: Simulation, wave: Array | None) -> Simulation:
     return replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
 
 
-def _of_axes(
+def waves_of_axes(
     bench: RotorBench,
     kind: str,
     n: int,
@@ -241,7 +243,7 @@ def _of_axes(
     excited = [known.index(axis) for axis in axes or known]
     blocks = len(excited) if kind == "orthogonal" else 1
     if periods is None:
-        periods = max(_LEAST_PERIODS, round(n / bench.rate_hz / blocks))
+        periods = max(LEAST_PERIODS, round(n / bench.rate_hz / blocks))
         while n % (periods * blocks) and periods > 1:
             periods -= 1
     period = n // (periods * blocks)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -158,6 +158,7 @@ class Running:
     memory: Array  # (n_axes, 3), of gains
     line: Array  # commands on their way, (whole delay + 2, n_axes)
     law: StateLaw | None
+    angle: float = 0.0  # of the rotor at the next sample, rad
 
     def hand_over(self, law: StateLaw, y: Array) -> None:
         """Go on with another law, whose states order of themselves what those of the last one would: by least squares
@@ -169,6 +170,28 @@ class Running:
         size = np.maximum(np.linalg.norm(new, axis=0), 1e-300)
         z = np.linalg.lstsq(new / size, old @ self.z, rcond=_TOLD)[0] / size
         self.z, self.law = z + np.linalg.pinv(law.C) @ (wanted - law.C @ z - law.D @ y), law
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Motion:
+    """What a stretch of a simulation gave, sample by sample."""
+
+    measured: Array  # (n_samples, n_outputs)
+    command: Array  # (n_samples, n_axes)
+    truth: Array  # (n_samples, n_axes + n_currents): what each axis sees of the rotor, then currents
+    angle: Array  # (n_samples,), rad
+    counts: NDArray[np.int64]  # first contact, first limited sample (-1: none), limited samples
+    lost: int = -1  # first sample that is not finite, or in which a gap closes; -1: none
+
+
+class _Fixed(NamedTuple):
+    """What the compiled loop is given of a bench, each stretch the same."""
+
+    size: Array  # of the noise of outputs, then disturbances
+    read: Array  # outputs of states
+    law: StateLaw | None
+    before_line: tuple[Any, Any, Any, Any, Any, Any, Any]  # arguments of the kernel, in its order
+    after_stops: tuple[Array, Array, NDArray[np.int64]]
 
 
 _TOLD = 1e-6  # of the largest singular value, from which commands tell of states
@@ -276,59 +299,33 @@ class RotorBench:
                 f"the excitation has shape {u.shape}; it must be (n_samples, {len(rotor.inputs)}), one column an axis, "
                 f"with more samples than the {settle} that settle. Reshape it"
             )
-        n = u.shape[0]
-        measured, command, truth = (np.empty((n, m)) for m in (len(rotor.outputs), u.shape[1], len(rotor.axes)))
-        truth = np.empty((n, len(rotor.axes) + len(self._currents)))
-        counts = np.array([-1, -1, 0], dtype=np.int64)
-        angle: Array = np.arange(n, dtype=np.float64) * (rotor.speed / self.rate_hz)
-        force, voltage = self.noise.held_rms(self.rate_hz)
-        sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
-        size = np.array([sizes[kind_of(name)] for name in (*rotor.outputs, *rotor.disturbances)])
-        disturbed = np.random.default_rng(seed).standard_normal((n, size.size)) * size
-        if load is not None:
-            disturbed[:, len(rotor.outputs) : len(rotor.outputs) + len(rotor.axes)] += load
-        lost = self._run(u, disturbed, start, angle, counts, measured, command, truth)
-        if lost >= 0:
-            at = f"sample {lost - settle} ({(lost - settle) / self.rate_hz:.6g} s)"
+        at = start if isinstance(start, Running) else self.begun(start)
+        moved = self.advance(at, u, np.random.default_rng(seed), load=load)
+        if moved.lost >= 0:
+            place = f"sample {moved.lost - settle} ({(moved.lost - settle) / self.rate_hz:.6g} s)"
             raise ModelError(
-                f"the simulation closes a gap or diverges at {at}; an unstable plant needs a loop that holds it. Give "
-                "limits.position, or another loop"
+                f"the simulation closes a gap or diverges at {place}; an unstable plant needs a loop that holds it. "
+                "Give limits.position, or another loop"
             )
         names = (
             *(f"{axis}_position" for axis in rotor.axes),
             *(name.replace("_amplifier", "") for name in self._currents),
         )
         low, high = self.limits.current
-        currents = truth[settle:, len(rotor.axes) :]
-        values = dict(zip(rotor.inputs, command[settle:].T, strict=True))
-        values |= dict(zip(rotor.outputs, measured[settle:].T, strict=True))
-        values |= {f"{axis}_reference": u[settle:, j] for j, axis in enumerate(rotor.axes)}
-        units = {
-            **rotor.units,
-            **dict.fromkeys((f"{axis}_reference" for axis in rotor.axes), rotor.units[rotor.inputs[0]]),
-        }
-        order = sorted(values, key=lambda name: rotor.axes.index(name.split("_")[0]))  # an axis after the other
-        channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
-        roles = {c.role for c in self.rig.channels}  # of a rotor that turns; speed and tacho where the rig names them
-        if rotor.speed or "angle" in roles:
-            channels.append(Channel(name="angle", unit="rad", values=angle[settle:]))
-        if "speed" in roles:
-            channels.append(Channel(name="speed", unit="rad/s", values=np.full(n - settle, rotor.speed)))
-        if "tacho" in roles:  # high in the first tenth of every revolution
-            pulses = np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0)
-            channels.append(Channel(name="tacho", unit="V", values=pulses[settle:]))
+        truth = moved.truth[settle:]
+        currents = truth[:, len(rotor.axes) :]
         origin = {"plant": f"{rotor.name}, {'nonlinear' if self.poles else 'linear'}", "seed": str(seed)}
         settings = {name: acting(getattr(self, name)) for name in ("loop", "noise", "limits")}
         record = Record(
             rate_hz=self.rate_hz,
-            channels=tuple(channels),
+            channels=self.channels(moved, u, settle),
             history=(Step(name="simulate", settings={**origin, "rate_hz": self.rate_hz, **settings}),),
             provenance=MappingProxyType({"simulator": "ambid.simulation", **origin}),
         )
-        first = [None if k < 0 else max(0, int(k) - settle) for k in counts[:2]]
+        first = [None if k < 0 else max(0, int(k) - settle) for k in moved.counts[:2]]
         return Simulation(
             record=as_columns(record, self.rig) if columns else record,
-            states=truth[settle:],
+            states=truth,
             state_names=names,
             truth=MappingProxyType(
                 {
@@ -339,10 +336,32 @@ class RotorBench:
             ),
             first_contact=first[0],
             first_saturated=first[1],
-            n_saturated=int(counts[2]),
+            n_saturated=int(moved.counts[2]),
             n_over_current=int(np.count_nonzero(((currents < low) | (currents > high)).any(axis=1))),
             largest_pole=self.largest_pole,
         )
+
+    def channels(self, moved: Motion, u: Array, settle: int = 0) -> tuple[Channel, ...]:
+        """Return what is logged of a motion under an excitation `u`, after the samples that settle, named by role."""
+        rotor = self.model
+        values = dict(zip(rotor.inputs, moved.command[settle:].T, strict=True))
+        values |= dict(zip(rotor.outputs, moved.measured[settle:].T, strict=True))
+        values |= {f"{axis}_reference": u[settle:, j] for j, axis in enumerate(rotor.axes)}
+        units = {
+            **rotor.units,
+            **dict.fromkeys((f"{axis}_reference" for axis in rotor.axes), rotor.units[rotor.inputs[0]]),
+        }
+        order = sorted(values, key=lambda name: rotor.axes.index(name.split("_")[0]))  # an axis after the other
+        channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
+        roles, angle = {c.role for c in self.rig.channels}, moved.angle[settle:]
+        if rotor.speed or "angle" in roles:  # of a rotor that turns; speed and tacho where the rig names them
+            channels.append(Channel(name="angle", unit="rad", values=angle))
+        if "speed" in roles:
+            channels.append(Channel(name="speed", unit="rad/s", values=np.full(angle.size, rotor.speed)))
+        if "tacho" in roles:  # high in the first tenth of every revolution
+            pulses = np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0)
+            channels.append(Channel(name="tacho", unit="V", values=pulses))
+        return tuple(channels)
 
     def largest(self, shape: Array, seed: int, fraction: float) -> float:
         """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits: the
@@ -355,19 +374,35 @@ class RotorBench:
         )  # fmt: skip
         return float(f"{amplitude:.3g}")
 
-    def _run(
-        self,
-        u: Array,
-        disturbed: Array,
-        start: Array | Running | None,
-        angle: Array,
-        counts: NDArray[np.int64],
-        measured: Array,
-        command: Array,
-        truth: Array,
-    ) -> int:
+    def advance(self, at: Running, u: Array, rng: np.random.Generator, *, load: Array | None = None) -> Motion:
+        """Carry a loop over the samples of an excitation (n_samples, n_axes), in place; `load` as `simulate` has it."""
         from ambid.simulation.kernels import run_rotor
 
+        rotor, n, fixed = self.model, u.shape[0], self._fixed
+        disturbed = rng.standard_normal((n, fixed.size.size)) * fixed.size
+        if load is not None:
+            disturbed[:, len(rotor.outputs) : len(rotor.outputs) + len(rotor.axes)] += load
+        if fixed.law is not None and fixed.law is not at.law:
+            at.hand_over(fixed.law, (fixed.read @ at.x)[signals_fed_back(rotor)])
+        turn = rotor.speed / self.rate_hz
+        moved = Motion(
+            measured=np.empty((n, len(rotor.outputs))), command=np.empty((n, u.shape[1])),
+            truth=np.empty((n, len(rotor.axes) + len(self._currents))),
+            angle=np.asarray(at.angle + np.arange(n, dtype=np.float64) * turn),
+            counts=np.array([-1, -1, 0], dtype=np.int64),
+        )  # fmt: skip
+        at.angle += n * turn
+        moved.lost = int(
+            run_rotor(
+                u, disturbed, self._runout(moved.angle), *fixed.before_line, at.line, self.limits.position,
+                *fixed.after_stops, at.x, at.z, at.memory, moved.counts, moved.measured, moved.command, moved.truth,
+            )
+        )  # fmt: skip
+        return moved
+
+    @cached_property
+    def _fixed(self) -> _Fixed:
+        """What stays the same from one stretch to the next."""
         rotor, period = self.model, 1.0 / self.rate_hz
         c, fraction, kinds = self.loop, self.loop.delay % 1.0, [name.rsplit("_", 1)[-1] for name in rotor.inputs]
         if len(set(kinds)) > 1:
@@ -386,25 +421,21 @@ class RotorBench:
             equations = a, b, late, e
         else:
             equations = self._nonlinear(self.poles, fraction)
-        at, law = start if isinstance(start, Running) else self.begun(start), law_on(c, rotor, self.rate_hz)
-        if law is not None and law is not at.law:
-            at.hand_over(law, (continuous.C @ at.x)[signals_fed_back(rotor)])
-        states = [rotor.states.index(name) for name in self._currents]
-        return int(
-            run_rotor(
-                u, disturbed, self._runout(angle),
-                equations, np.ascontiguousarray(continuous.C), fed_back(rotor),
-                np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
-                matrices_of(law), np.array(steps[:-1]),
-                (*getattr(self.limits, kind_of(rotor.inputs[0])), steps[-1]), at.line,
-                self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), at.x, at.z, at.memory, counts,
-                measured, command, truth,
-            )
+        force, voltage = self.noise.held_rms(self.rate_hz)
+        sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
+        read, law = np.ascontiguousarray(continuous.C), law_on(c, rotor, self.rate_hz)
+        return _Fixed(
+            size=np.array([sizes[kind_of(name)] for name in (*rotor.outputs, *rotor.disturbances)]), read=read, law=law,
+            before_line=(
+                equations, read, fed_back(rotor), np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
+                matrices_of(law), np.array(steps[:-1]), (*getattr(self.limits, kind_of(rotor.inputs[0])), steps[-1]),
+            ),
+            after_stops=(magnets, pushes, np.array([rotor.states.index(x) for x in self._currents], dtype=np.int64)),
         )  # fmt: skip
 
     def begun(self, start: Array | None = None) -> Running:
         """Return the loop at its beginning, with some states of the plant, by default at rest."""
-        rotor, law, n = self.model, law_on(self.loop, self.model, self.rate_hz), len(self.model.inputs)
+        rotor, law, n = self.model, self._fixed.law, len(self.model.inputs)
         x, memory = np.zeros(len(rotor.states) + 2), np.zeros((n, 3))
         x[: len(rotor.states)] = 0.0 if start is None else start
         x[-2], memory[:, 2] = 1.0, np.nan

@@ -25,15 +25,13 @@ def open_device(
     of a serial port; `pace` is of what is no hardware, which has its own, `seed` of the noise of what is emulated or
     simulated.
     """
-    if rig.rotor is not None:
+    if rig.rotor is not None and port != "simulated" and not port.startswith(REPLAY):
         making = command("simulate", "RIG", excitation="zippered", excitation_only=True, out="FILE.csv")
-        remedy = (
-            f"Follow a record by '{command('track', 'RECORD', rig='RIG')}'"
-            if port.startswith(REPLAY)
-            else f"Write the excitation by '{making}', play it on the rotor's own controllers, and "
-            "give their record to 'ambid identify' or 'ambid track'"
+        raise DeviceError(
+            f"rig {rig.name!r} has {len(rig.rotor.axes)} axes; this controller drives one. Choose port simulated, or "
+            f"write the excitation by '{making}', play it on the rotor's own controllers, and give their record to "
+            "'ambid identify' or 'ambid track', or replay it"
         )
-        raise DeviceError(f"rig {rig.name!r} has {len(rig.rotor.axes)} axes; this controller drives one. {remedy}")
     if bench is not None and port not in ("emulated", "simulated"):
         raise DeviceError(f"a bench is chosen for ports emulated and simulated only; {port!r} has its own. Omit it")
     if not port.strip():
@@ -42,6 +40,10 @@ def open_device(
         from ambid.acquisition.devices.emulated import EmulatedDevice
 
         return EmulatedDevice(rig, bench=bench, pace=pace, seed=seed)
+    if port == "simulated" and rig.rotor is not None:
+        from ambid.acquisition.devices.rotor import RotorDevice
+
+        return RotorDevice(rig, bench=bench, pace=pace, seed=seed)
     if port == "simulated":
         from ambid.acquisition.devices.simulated import SimulatedDevice
 

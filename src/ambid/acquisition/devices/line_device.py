@@ -15,6 +15,7 @@ import numpy as np
 
 from ambid.acquisition.device import (
     MODES,
+    AxesProgram,
     Counters,
     DeviceEvent,
     DeviceInfo,
@@ -28,7 +29,7 @@ from ambid.acquisition.device import (
 from ambid.acquisition.devices.controller import Controller, Port, open_port
 from ambid.acquisition.devices.played import FrameQueue
 from ambid.acquisition.law_words import LawWords
-from ambid.acquisition.program import counts_of
+from ambid.acquisition.program import counts_of, of_one_axis
 from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import Message
 from ambid.acquisition.protocol.samples import SampleCounters, SampleDecoder, Samples
@@ -389,7 +390,7 @@ class LineDevice(ABC):
             raise
         self._stream.enter(MODES[mode], unless_fault=True)  # it may have tripped in its first tick
 
-    def excite(self, program: Program | None) -> None:
+    def excite(self, program: Program | AxesProgram | None) -> None:
         """As `Device.excite`."""
         on = self.state in ("driving", "levitating")
         if program is not None and not on:
@@ -407,8 +408,9 @@ class LineDevice(ABC):
         if program.kind != "none":
             self._ask("excite", {"on": 1})
 
-    def load(self, program: Program) -> None:
+    def load(self, program: Program | AxesProgram) -> None:
         """As `Device.load`."""
+        program = of_one_axis(program)
         fields = counts_of(program, self._rig, self._settings)
         for at in range(0, len(program.table), _TABLE_PART):
             self._ask("table", {"offset": at}, values=program.table[at : at + _TABLE_PART])

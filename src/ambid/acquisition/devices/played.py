@@ -17,6 +17,7 @@ import numpy as np
 
 from ambid.acquisition.device import (
     MODES,
+    AxesProgram,
     Column,
     Counters,
     DeviceEvent,
@@ -29,7 +30,6 @@ from ambid.acquisition.device import (
     check_mode,
 )
 from ambid.errors import DeviceError, RecordError
-from ambid.physics.linear_model import model
 from ambid.record import Record, read_rows
 from ambid.rig.rig import Rig, role_units
 from ambid.tracking.blocks import Block, Frame, Replay, blocks_of
@@ -149,7 +149,7 @@ class PlayedDevice(ABC):
         """Start out of idle, or from sampling."""
 
     @abstractmethod
-    def _play(self, program: Program | None) -> None:
+    def _play(self, program: Program | AxesProgram | None) -> None:
         """Excite."""
 
     @abstractmethod
@@ -208,7 +208,7 @@ class PlayedDevice(ABC):
                 self._flowing, self._began_s, self._began = True, time.perf_counter(), self._next
             self._enter_state(MODES[mode])
 
-    def excite(self, program: Program | None) -> None:
+    def excite(self, program: Program | AxesProgram | None) -> None:
         """As `Device.excite`."""
         with self._lock:
             self._ready("excite")
@@ -216,7 +216,7 @@ class PlayedDevice(ABC):
                 self._refuse("excite", "an excitation is played while driving or levitating. Start one of these first")
             self._play(program)
 
-    def load(self, program: Program) -> None:  # noqa: B027 - there is no line on which it would take time
+    def load(self, program: Program | AxesProgram) -> None:  # noqa: B027 - there is no line on which it would take time
         """As `Device.load`."""
 
     def arm(self, trial: LawTrial) -> None:  # noqa: ARG002 - a contract
@@ -379,7 +379,7 @@ class ReplayDevice(PlayedDevice):
             self._refuse_playing(f"mode {mode!r}")
         self._row, self._base = 0, self._next
 
-    def _play(self, program: Program | None) -> None:
+    def _play(self, program: Program | AxesProgram | None) -> None:
         if program is not None:
             self._refuse_playing("an excitation")
 
@@ -415,7 +415,7 @@ class ReplayDevice(PlayedDevice):
 
 def _check_units(record: Record, rig: Rig, where: str) -> None:
     """Refuse a column whose unit is not the one that the rig's calibration begins with; one without unit may pass."""
-    wanted = role_units(model(rig.model))
+    wanted = role_units(rig.plant)
     for c in rig.channels:
         channel, calibration = record.channel(c.column), c.calibration
         if c.unit is not None or channel.unit == UNKNOWN:

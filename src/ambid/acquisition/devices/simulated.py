@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquisition.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
+from ambid.acquisition.device import AxesProgram, DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquisition.devices.benches import bench_of, instruments
 from ambid.acquisition.devices.played import Pace, PlayedDevice
 from ambid.acquisition.law_words import BEGIN, WATCH_MS
-from ambid.acquisition.program import counts_of
+from ambid.acquisition.program import counts_of, of_one_axis
 from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, Scale, output_rates
 from ambid.acquisition.settings import (
@@ -141,12 +141,13 @@ class SimulatedDevice(PlayedDevice):
         if self._flowing and not self._settings.current_low <= self._current <= self._settings.current_high:
             self._refuse("clear", "the current is still outside its limits. Wait until it is gone")
 
-    def _play(self, program: Program | None) -> None:
+    def _play(self, program: Program | AxesProgram | None) -> None:
         from ambid.acquisition.devices import _kernels as k
 
         self._memory[k.PLAYING] = 0
         if program is None:
             return
+        program = of_one_axis(program)
         fields = counts_of(program, self._rig, self._settings)
         self._table[: len(program.table)] = program.table
         for place, name in enumerate(("kind", "amplitude", "hold", "length", "cycles")):
