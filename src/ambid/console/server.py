@@ -40,7 +40,7 @@ from ambid.console.runs import MOVING, Run, Runs
 from ambid.errors import AmbidError
 from ambid.settings.caller import setting
 
-_LOOKS = ("preview", "look", "history", "result")  # jobs that change nothing
+_LOOKS = ("preview", "look", "history", "result", "fleet")  # jobs that change nothing
 
 _POLL_S = 0.02  # between two looks at a feed
 _ANSWER_POLL_S = 0.005  # between two looks for an answer
@@ -73,6 +73,7 @@ _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     ),
     "history": ({"ledger": "ledger"}, {"bearing": str}, ""),
     "result": ({"estimate": "result"}, {}, ""),
+    "fleet": ({"ledger": "ledger"}, {}, ""),
     "rig": ({}, {"text": str}, ".toml"),
     "identify": ({"record": "record", "rig": "rig"}, {}, ".json"),
     "margins": ({"record": "record", "rig": "rig", "estimate": "result"}, {}, ".json"),
@@ -95,6 +96,7 @@ _CHOICES = {
     "weights": tuple(WINDOWS),
 }
 _NEEDED = {"preview": ("record",), "look": ("record",), "history": ("ledger",), "result": ("estimate",),
+           "fleet": ("ledger",),
            "identify": ("record", "rig"),
            "margins": ("rig",), "design": ("rig", "estimate"), "live": ("rig", "port"),
            "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip

@@ -604,9 +604,16 @@ def _commission(worker: Worker) -> None:
             raise KeyboardInterrupt
 
 
+def _fleet(worker: Worker) -> None:
+    from ambid.console.fleet_view import tell_fleet
+
+    tell_fleet(worker.named("ledger"), worker.feed, worker.tick)
+
+
 JOBS: Mapping[str, Callable[[Worker], None]] = {
     "preview": _preview, "look": _look, "result": _result, "rig": _rig, "identify": _identify, "margins": _margins,
-    "design": _design, "export": _export, "history": _history, "live": _live, "commission": _commission,
+    "design": _design, "export": _export, "history": _history, "fleet": _fleet, "live": _live,
+    "commission": _commission,
 }  # fmt: skip
 
 

@@ -29,6 +29,11 @@ export async function refresh() {
     : "There is no rig in this folder yet. Choose a record under Files: a rig is drafted from it, checked and written there. ";
   for (const [of, next] of Object.entries(NEXT)) $(`${of}-hint`).textContent = state.read_only ? bare : bare + next;
   choices($("history-form").elements.ledger, state.files.filter((f) => f.kind === "ledger"));
+  choices($("fleet-form").elements.ledger, state.files.filter((f) => f.kind === "ledger"));
+  $("fleet-form").hidden = !$("fleet-form").elements.ledger.value;
+  $("fleet-hint").textContent = !$("fleet-form").hidden
+    ? "How every bearing of a ledger stands, by its estimates alone. A click shows its history." : "There is no ledger in this folder yet. "
+    + "'ambid identify RECORD --ledger works.db', or 'ambid fleet' for many records, keeps each estimate in one.";
   $("history-form").hidden = !$("history-form").elements.ledger.value;
   $("history-hint").textContent = $("history-form").hidden
     ? "There is no ledger in this folder yet. 'ambid identify RECORD --ledger works.db' keeps each estimate in one; "

@@ -1,6 +1,7 @@
 // The page of the console: plain JavaScript modules, no build step. All text from files goes in as text, never as HTML.
 // Colours: as the machine has them, or as chosen; a cookie, since the port is another one each time.
 import { $, feed, show, state } from "./core.js";
+import "./fleet.js";
 import { refresh } from "./lists.js";
 import { recolour } from "./plot.js";
 import { watch } from "./start.js";
@@ -18,7 +19,7 @@ $("theme").onchange = () => {
 };
 dark.addEventListener("change", colours);
 colours();
-if (["files", "live", "commission", "history"].includes(location.hash.slice(1))) show(location.hash.slice(1));
+if (["files", "live", "commission", "history", "fleet"].includes(location.hash.slice(1))) show(location.hash.slice(1));
 refresh().catch(trouble);
 let listing = false;  // one at a time: a browser asks six things of a server at once, and Stop does not queue behind them
 setInterval(() => {
