@@ -1,9 +1,10 @@
 """The console at real pace: what worker and server take, how soon a sample is a pixel, and whether anything grows.
 
 ``PYTHONPATH=. python bench/console.py [SECONDS]``: a record of an unstable bearing at 20 kHz is replayed, recorded and
-tracked with its three signals, then eight signals are shown without tracking; where Chromium is installed, a page
-watches. Before that, one axis of 20,000 samples is identified in turn by the command and by a click on the page: the
-time until the verdict stands. Figures are printed; none is asserted.
+tracked with its three signals, then eight signals are shown without tracking, then a simulated rotor with eight signals
+is levitated and tracked; where Chromium is installed, a page watches. Before that, one axis of 20,000 samples is
+identified in turn by the command and by a click on the page: the time until the verdict stands. Figures are printed;
+none is asserted.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from ambid import identify, simulate
 from ambid.console.envelope import EnvelopeTap
 from ambid.console.feed import FeedReader, FeedWriter, json_frames
 from ambid.console.runs import Run, Runs
@@ -75,6 +77,7 @@ def main(seconds: float) -> None:
             time.sleep(1.0)
             watched(f"20 kHz, {SIGNALS} strips, envelopes alone", page, Run(place), writer.pid, min(seconds, 60.0))
             writer.wait()
+            rotor(page, folder, min(seconds, 60.0))
     with tempfile.TemporaryDirectory() as made:
         killed(Path(made), 20)
 
@@ -115,6 +118,23 @@ def verdicts(folder: Path, times: int) -> None:
     print(
         f"  ratio median {np.median(ratio):.2f}, most {ratio.max():.2f}; load average {os.getloadavg()[0]:.1f}",
         flush=True,
+    )
+
+
+def rotor(page: Started, folder: Path, seconds: float) -> None:
+    """Levitate a rotor of four axes at 20 kHz, recorded and tracked from an estimate."""
+    rig = rig_of_preset(preset("utrc"))
+    write_rig(rig, folder / "rotor.toml")
+    identify(simulate(rig, duration=3.0, seed=1), rig).save(folder / "rotor.json")
+    files = {"rig": page.number("rotor.toml"), "estimate": page.number("rotor.json")}
+    wish = {"job": "live", "port": "simulated", "excitation": "multisine", "seconds": seconds, "pace": "real-time"}
+    run = Runs(folder).one(page.json("POST", "/api/runs", {**wish, **files, "out": "rotor"})["id"])
+    watched("20 kHz, rotor of 4 axes, 8 strips, orbits, tracked", page, run, pid_of(run), seconds)
+    said = list(told_by(run))
+    lags = [1e3 * x["lag_s"] for x in said if x["kind"] == "line"]
+    kept = next(x for x in said if x["kind"] == "recorded")
+    print(
+        f"  block to parameters: median {np.median(lags):.0f} ms, most {max(lags):.0f} ms; {kept['lost']} samples lost"
     )
 
 

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ambid import identify, simulate
 from ambid.acquisition.quality import Quality
 from ambid.acquisition.recorder import Recorder
 from ambid.errors import DeviceError
+from ambid.physics.presets import preset
 from ambid.record import read_record
+from ambid.rig import rig_of_preset, write_rig
 from tests.firmware.conftest import avr_gcc, bench_program, firmware_elf, native_cc
 from tests.job.benches import COIL, PLAIN, PROTOTYPE_FILE, THESIS, Silent, Spoiled, prototype
 
@@ -442,3 +445,34 @@ def test_the_help_names_ports_modes_and_the_journal(ambid):
     assert done.code == 0
     for word in ("emulated", "simulated", "replay:FILE", "--track", "levitate", "ambid recover", "--strict"):
         assert word in " ".join(done.out.split())
+
+
+@pytest.fixture(scope="module")
+def rotor(tmp_path_factory):
+    """A rotor's rig, and an estimate of it."""
+    rig, made = rig_of_preset(preset("camb")), tmp_path_factory.mktemp("rotor")
+    write_rig(rig, made / "rotor.toml")
+    identify(simulate(rig, duration=3.0, seed=1), rig).save(made / "start.json")
+    return made
+
+
+def test_a_rotor_is_levitated_tracked_and_its_loop_told(acquire, place, rotor):
+    words = ("--seconds", "5", "--excitation", "zippered", "--amplitude", "4")
+    done = acquire(*words, "--track", f"{rotor}/start.json", "--json", "t.jsonl", rig=f"{rotor}/rotor.toml")
+    assert done.code == 0
+    assert samples() == 100_000
+    lines = [json.loads(line) for line in (place / "t.jsonl").read_text().splitlines()]
+    assert len(lines) == 1 + 2 + 1
+    assert {f"{axis}.k_x" for axis in ("ax", "ay", "bx", "by", "az")} <= set(lines[1]["parameters"])
+    told = done.out[done.out.index("sensitivity at 3 s") :].splitlines()[1:6]
+    assert [line.split()[0] for line in told] == ["ax", "ay", "bx", "by", "az"]
+    assert all(line.endswith(", measured") for line in told)
+
+
+def test_a_rotor_that_nothing_excites_is_recorded_and_its_loop_predicted(acquire, rotor):
+    done = acquire("--seconds", "3", "--track", f"{rotor}/start.json", rig=f"{rotor}/rotor.toml")
+    assert done.code == 2
+    assert done.out.count(", predicted") == 5
+    assert "not periodic" in done.err
+    assert "o.h5 holds all 60000 samples" in done.err
+    assert samples() == 60_000

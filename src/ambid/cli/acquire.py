@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ambid.estimation.estimate import Estimate
     from ambid.recursive.lines import Track
     from ambid.rig import Rig
+    from ambid.rotor.estimate import RotorEstimate
 
 _ENDINGS = (".h5", ".hdf5", ".csv", ".csv.gz")
 
@@ -49,7 +50,7 @@ def command(v: Values) -> None:
     known, stop, behind = load_rig(v.rig), Stop(), None if v.bench is None else preset_of(v.bench) or v.bench
     settings = v.only("seconds excitation amplitude band mode settle seed")
     settings |= {"stopped": stop.wished, "arm": None if v.arm is None else load_rig(v.arm)}
-    wanted, start, before = Request(**settings), start_of_track(v.track), _changed(v.out)
+    wanted, start, before = Request(**settings), start_of_track(v.track, known), _changed(v.out)
     job = Recording(wanted.measured(known), v.port, v.out, wanted.trial(v.port, known).settle_s, stop, force=v.force)
     if (v.out.exists() or v.out.is_symlink()) and not v.force:
         raise AmbidError(f"-o {v.out} already exists. Choose another name, or give --force")
@@ -93,7 +94,7 @@ class Recording:
         self.rig, self.port, self.path, self.settle_s, self.stop, self.force = rig, port, record, settle_s, stop, force
 
     def follow(
-        self, device: Device, course: Course, start: Estimate | None, json: str | None
+        self, device: Device, course: Course, start: Estimate | RotorEstimate | None, json: str | None
     ) -> tuple[Acquired, Callable[[], None]]:
         """Record, and track what is recorded from `start`, or from an estimate of the first part.
 
@@ -106,16 +107,20 @@ class Recording:
         follower = Follower(json, keep=False, real_time=device.info.kind == "serial")
         runs: list[RunReport] = []
         failures: list[AmbidError] = []
+        loops: list[str] = []  # the last one of a rotor
 
         def lost(what: AmbidError) -> None:
             failures.append(what)
             typer.echo(f"ambid: tracking ended, recording continues: {what}", err=True)
 
+        def judged(t: float, sensitivity: Mapping[str, Any]) -> None:
+            loops[:] = loop_lines(t, sensitivity)
+
         def job() -> Track:
             made = track_live(
                 device, self.rig, course, start=start, taps=[tap], on_event=tap.tell, on_run=runs.append,
                 on_trouble=lost, on_header=follower.on_header, on_line=follower.on_line, keep=False,
-                on_lag=follower.on_lag,
+                on_lag=follower.on_lag, on_loop=judged,
             )  # fmt: skip
             if made.overruns:
                 typer.echo(
@@ -130,14 +135,16 @@ class Recording:
                 follower.run(job)
             except (AmbidError, KeyboardInterrupt) as failure:
                 # What ended tracking does not end the record: it is kept, and judged below.
-                if not runs or not (failures or isinstance(failure, KeyboardInterrupt) or runs[0].fault):
+                if not runs:
                     raise
                 if isinstance(failure, KeyboardInterrupt):
                     self.stop.number = self.stop.number or (follower.code or INTERRUPTED) - 128
+                elif not failures and runs[0].fault is None:  # the run was over before
+                    failures.append(failure)
 
         def ending() -> None:
             if json != "-":
-                typer.echo("")
+                typer.echo("\n".join(["", *loops]))
             if failures:
                 raise AmbidError(f"{failures[0]}; {self.path} holds all {runs[0].samples} samples")
             if follower.track is not None or (runs[0].fault is None and not self.stop.wished()):
@@ -219,10 +226,14 @@ def _journal(record: Path) -> Path:
     return journal_path(record)
 
 
-def start_of_track(track: str | None) -> Estimate | None:
+def start_of_track(track: str | None, rig: Rig) -> Estimate | RotorEstimate | None:
     """Read the estimate that tracking is to begin with; None where none is named."""
     if track in (None, "auto"):
         return None
+    if rig.rotor is not None:
+        from ambid.job.track_rotor import given_start
+
+        return given_start(str(track))
     from ambid.job.results import read_linear_estimate
 
     return read_linear_estimate(
@@ -230,6 +241,19 @@ def start_of_track(track: str | None) -> Estimate | None:
         f"--track {track} is a black-box fit or a nonlinear estimate; tracking needs linear physical parameters. "
         "Give an estimate of 'ambid identify --json' without --nonlinear",
     )
+
+
+def loop_lines(t: float, sensitivity: Mapping[str, Any]) -> list[str]:
+    """Write the sensitivity of each axis of a rotor beside its run, as an estimate has it."""
+    from ambid.control.zones import Zone
+    from ambid.estimation.result import NORMAL_95
+
+    zones = {axis: Zone.read(entry) for axis, entry in sensitivity.items()}
+    lines = [
+        f"  {axis}  {z.peak_db:.2f} dB, 95 % within ± {NORMAL_95 * z.sd_db:.2f} dB, zone {z.words}, {z.source}"
+        for axis, z in zones.items()
+    ]
+    return [f"sensitivity at {t:.4g} s, opened at the position:", *lines, ""] if lines else []
 
 
 def _say_trouble(what: AmbidError) -> None:

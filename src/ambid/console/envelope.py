@@ -55,14 +55,16 @@ class Journal(Protocol):
 class EnvelopeTap:
     """Takes the blocks of a run, and writes envelopes of its roles into a feed, of a sample once the journal has it.
 
-    `view`: of device and rig; `journal`: takes each block before; `limits`: of roles, where an alarm is told.
+    `view`: of device and rig; `journal`: takes each block before; `limits`: of roles, where an alarm is told; `beside`:
+    also given the rows that are shown, as the device has them, and the time after them.
     """
 
     def __init__(
         self, feed: FeedWriter, view: BenchView, journal: Journal,
         limits: Mapping[str, Sequence[Mapping[str, Any]]] = MappingProxyType({}),
+        beside: Callable[[Array, float], object] | None = None,
     ) -> None:  # fmt: skip
-        self._feed, self._view, self._journal = feed, view, journal
+        self._feed, self._view, self._journal, self._beside = feed, view, journal, beside
         self._group = max(1, round(view.rate_hz / _PER_SECOND))
         self._stretches = deque[_Stretch]()
         self._lost = self._next = 0
@@ -134,6 +136,8 @@ class EnvelopeTap:
         wall = time.time() - (time.perf_counter() - arrived_s) - (self._next - part.first) / rate_hz
         head = _HEAD.pack(first, self._lost, n, len(seen), self._group, (first + end) / rate_hz, wall)
         self._feed.envelope(head + both.tobytes())
+        if self._beside is not None:
+            self._beside(rows[:end], (first + end) / rate_hz)
 
     def _watch(self, seen: Array, first: int) -> None:
         """Tell an alarm where samples were lost, or a signal passes a limit; again once it was inside for a second."""

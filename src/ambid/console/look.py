@@ -108,7 +108,7 @@ def limits(rig: Rig, *, columns: bool = False) -> Mapping[str, Sequence[Mapping[
     """
     found = dict[str, Sequence[Mapping[str, Any]]]()
     for c in rig.channels:
-        role: Any = c.role.rpartition(".")[2]
+        role: Any = c.role.rpartition("_")[2].rstrip("0123456789")  # of a rotor: of any axis
         words = [(getattr(rig.limits, role), _WORDS[role])] if rig.limits is not None and role in _WORDS else []
         words += [(rig.trip(role), "trip")] if rig.daq is not None and role in ("position", "current") else []
         calibration = c.calibration

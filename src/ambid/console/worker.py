@@ -27,6 +27,7 @@ from ambid.console.envelope import EnvelopeTap, throttled
 from ambid.console.feed import FeedWriter
 from ambid.console.folder import Folder, plain
 from ambid.console.orders import LATE, Desk, Order
+from ambid.console.rotor_view import Orbits, loop_content
 from ambid.console.runs import MOVING, Heard, Run, size_of, usual_times
 from ambid.console.words import PAGE_WORDS, RIG_WORDS
 from ambid.errors import AmbidError
@@ -371,23 +372,26 @@ def _export(worker: Worker) -> None:
 def _live(worker: Worker) -> None:
     """Record and track what a device samples."""
     from ambid.acquisition.session import recording
-    from ambid.acquisition.settings import BenchView
+    from ambid.acquisition.settings import BenchView, fault_words
     from ambid.console.look import limits
     from ambid.job.acquiring import Request, ready
     from ambid.job.results import read_linear_estimate
     from ambid.job.track_live import track_live
-    from ambid.physics.linear_model import model
+    from ambid.job.track_rotor import given_start
     from ambid.rig import load_rig
 
     spec, rig_path, start, arm = worker.spec, worker.path("rig"), worker.path("estimate"), worker.path("arm")
     assert rig_path is not None
     rig, out = load_rig(rig_path), worker.folder / str(spec["out"])
-    known = None if start is None else read_linear_estimate(start, f"{start.name} is no linear estimate. Choose one")
+    plant, known = rig.plant, None
+    if start is not None:
+        wrong = f"{start.name} is no linear estimate. Choose one"
+        known = read_linear_estimate(start, wrong) if rig.rotor is None else given_start(start)
     wanted = Request(
         seconds=min(float(spec.get("seconds", 60.0)), _LONGEST_S), excitation=spec.get("excitation") or None,
         amplitude=spec.get("amplitude"), seed=0, stopped=worker.stopped, arm=None if arm is None else load_rig(arm),
     )  # fmt: skip
-    plant, runs = model(rig.model), list[Any]()
+    runs, shown = list[Any](), (*plant.inputs, *plant.outputs) if rig.rotor is None else plant.outputs
     if spec.get("pace", "real-time") == "real-time":
         _before_others()
     opening = ready(
@@ -395,24 +399,29 @@ def _live(worker: Worker) -> None:
         tick=worker.tick,
     )  # fmt: skip
     with opening as (bare, course), worker.minded(bare) as device:
-        view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
-        told = _Lines(worker)
+        view = BenchView(device.info, rig, shown)
+        told = _Lines(worker, orders=rig.rotor is None)
         opening_record = recording(device, rig, out, course, on_trouble=lambda e: worker.note(str(e)))
         with _storing(opening_record) as tap:
-            picture = EnvelopeTap(worker.feed, view, tap, limits(rig))
+            orbits = None if rig.rotor is None else Orbits(worker.feed, rig, device.info)
+            picture = EnvelopeTap(worker.feed, view, tap, limits(rig), None if orbits is None else orbits.take)
 
             def event(what: Any) -> None:
                 tap.tell(what)
-                worker.feed.tell("device", {"what": what.kind, "text": what.what, "sample": what.sample})
+                text = fault_words(what) if what.kind == "fault" else what.what
+                worker.feed.tell("device", {"what": what.kind, "text": text, "sample": what.sample})
+
+            troubles = list[str]()
 
             def trouble(error: AmbidError) -> None:
                 worker.follow(on=False)
+                troubles.append(str(error))
                 worker.note(f"tracking ended, recording continues: {error}")
 
             try:
                 made = track_live(
                     device, rig, course, start=known, taps=[tap, picture], on_event=event, on_run=runs.append,
-                    on_trouble=trouble,
+                    on_trouble=trouble, on_loop=told.loop,
                     on_header=told.header, on_line=told.line, on_lag=told.lag, keep=False, every_s=0.02,
                     stopped=lambda: worker.stopped() or tap.failed is not None,  # a run that is not stored ends
                 )  # fmt: skip
@@ -420,7 +429,8 @@ def _live(worker: Worker) -> None:
             except AmbidError as refusal:
                 if not runs:
                     raise
-                worker.note(str(refusal))
+                if str(refusal) not in troubles:
+                    worker.note(str(refusal))
             finally:
                 worker.follow(on=False)
         picture.end()
@@ -476,8 +486,9 @@ class _Minded:
 class _Lines:
     """Tells the lines of a track at a pace that eyes can follow; events at once."""
 
-    def __init__(self, worker: Worker) -> None:
+    def __init__(self, worker: Worker, *, orders: bool) -> None:
         self._worker, self._lag, self._last = worker, 0.0, float("-inf")
+        self._orders = orders  # whether an operator may lead the tracker
         self._state: LiveState | None = None
 
     def header(self, header: Any) -> None:
@@ -493,7 +504,11 @@ class _Lines:
             sticky="header",
         )  # fmt: skip
         self._worker.feed.keep("told", lambda: {"events": [_told(e) for e in state.events]})
-        self._worker.follow(on=True)
+        if self._orders:
+            self._worker.follow(on=True)
+
+    def loop(self, t: float, sensitivity: Mapping[str, Any]) -> None:
+        self._worker.feed.tell("loop", loop_content(t, sensitivity), sticky="loop")
 
     def lag(self, lag_s: float) -> None:
         self._lag = max(lag_s, self._lag)

@@ -171,7 +171,7 @@ def acquire(
     ----------
     port : str
         A serial port, ``"emulated"`` (the firmware on an emulated controller before a simulated bench),
-        ``"simulated"`` (a simulated bench alone), or ``"replay:FILE"``.
+        ``"simulated"`` (a simulated bench alone, or a rotor in its bearings), or ``"replay:FILE"``.
     rig : Rig, str or Path
         Calibrations, ``[loop]``, ``[daq]``.
     out : str or Path
@@ -180,9 +180,11 @@ def acquire(
         Length of the record in s.
     excitation : {"multisine", "schroeder", "prbs", "steps"}, Path or Experiment, optional
         Signal that the controller adds to its output; default none. Or what `ambid.design_experiment` designed for a
-        rig with ``[daq]``, or its file.
+        rig with ``[daq]`` or a rotor, or its file. Of a simulated rotor, as of `ambid.simulate`: ``multisine`` is then
+        ``zippered``.
     amplitude : float, optional
-        Peak of the excitation in V; default: found by trials, smallest first.
+        Peak of the excitation in V; default: found by trials, smallest first; of a simulated rotor half of what the
+        limits allow.
     band : (float, float), optional
         Band of the excitation in Hz; default: where the rotor moves, or what the controller can play.
     mode : {"sample", "drive", "levitate"}, optional

@@ -5,7 +5,7 @@ An identification, or a check of the start, takes the stream's beginning, which 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil
@@ -13,11 +13,11 @@ from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
 from types import MappingProxyType
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
-from ambid.acquisition.device import Device, DeviceEvent
+from ambid.acquisition.device import AxesProgram, Device, DeviceEvent
 from ambid.acquisition.session import Course, RunReport, Tap, run
 from ambid.acquisition.settings import BenchView, fault_words
 from ambid.arrays import Array
@@ -26,11 +26,12 @@ from ambid.estimation.estimate import Estimate
 from ambid.job.following import Following, FollowingWords
 from ambid.job.track_start import BenchRows, start_of
 from ambid.job.tracking import follow
-from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.rig import Rig
 from ambid.rig.load import SELECTED
+from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.spectra import find_excitation
 from ambid.tracking.blocks import Block, Frame, Replay
 from ambid.tracking.ring import BlockRing
 
@@ -39,6 +40,9 @@ _QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, o
 _BLOCKS_PER_S = 250  # that a port gives at most, however few samples each of them holds
 _CHECKED_S = 0.5  # of the stream that a given start is checked with
 _IDENTIFIED_S, _IDENTIFIED_SAMPLES = 2.0, 10_000  # at least, where a start is to be identified
+
+_IDENTIFIED_PERIODS, _CHECKED_PERIODS = 4, 3  # of a rotor's excitation
+_LOOKED_S, _SOUGHT_S = 1.0, 8.0  # of a rotor's stream, after which periods are looked for each time, and at most
 
 LOOK_S = 0.1
 """How long a wait may last before it is looked whether it is still wanted, s."""
@@ -58,25 +62,31 @@ def track_live(
     rig: Rig,
     course: Course,
     *,
-    start: Estimate | str | Path | float | None = None,
+    start: Estimate | RotorEstimate | str | Path | float | None = None,
     taps: Sequence[Tap] = (),
     on_event: Callable[[DeviceEvent], object] | None = None,
     on_run: Callable[[RunReport], object] | None = None,
     on_trouble: Callable[[AmbidError], object] | None = None,
     on_lag: Callable[[float], object] = lambda _: None,
+    on_loop: Callable[[float, Mapping[str, Any]], object] = lambda _, __: None,
     stopped: Callable[[], bool] = lambda: False,
     **following: Unpack[FollowingWords],
 ) -> LiveTrack:
     """Let an opened, idle `device` do a `course`, and follow its bench once it has settled, to the course's end, a
     fault, or an interrupt. `start`: an estimate, or the seconds from which one is identified; `taps`: other listeners,
     such as a recorder; `on_event`: of the device, in the run's thread; `on_run`: given its result, also of interrupted
-    tracking; `on_lag`: told a block's time from last sample to done work, s. Times of `Following` count from the first
-    tracked sample.
+    tracking; `on_lag`: told a block's time from last sample to done work, s; `on_loop`: of a rotor, told a time and the
+    sensitivity of each axis. Times of `Following` count from the first tracked sample.
     """
-    plant = model(rig.model)
-    view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
-    start = max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / view.rate_hz) if start is None else start
-    wanted_s = start if isinstance(start, (int, float)) else _CHECKED_S
+    plant = rig.plant
+    view = BenchView(
+        device.info, rig, (*plant.inputs, *plant.outputs) if rig.rotor is None else [c.role for c in rig.channels]
+    )
+    if rig.rotor is None:
+        start = max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / view.rate_hz) if start is None else start
+        wanted_s = start if isinstance(start, (int, float)) else _CHECKED_S
+    else:
+        wanted_s = _rotor_start_s(course, start, view.rate_hz)
     if course.seconds <= wanted_s:
         raise DeviceError(
             f"tracking needs {wanted_s:g} s for its start, and the run lasts {course.seconds:g} s. Run longer"
@@ -91,30 +101,64 @@ def track_live(
         runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
         with runner:
             lead = _Lead(_frames(ring, ring_tap.fresh), runner, wanted_s, view, device.info.port)
-            begin = start_of(lead.source, rig, start=start, rig_speaks=True)
-            track = follow(lead.frames(begin.first, on_lag), lead.source, begin, Following(**following), live=True)
+            if rig.rotor is not None:
+                from ambid.job.track_rotor import follow_rotor
+
+                known = isinstance(course.program, AxesProgram) or isinstance(start, (int, float))
+                sought_s = 0.0 if known else min(course.seconds / 3.0, _SOUGHT_S)
+                source, how = lead.periodic(rig, sought_s), Following(**following)
+                frames = lead.frames(None, 0, lambda _: None)
+                track = follow_rotor(source, frames, rig, start, how, on_lag=on_lag, on_loop=on_loop)
+            else:
+                assert not isinstance(start, RotorEstimate)
+                source = lead.source
+                begin = start_of(source, rig, start=start, rig_speaks=True)
+                frames = lead.frames(source, begin.first, on_lag)
+                track = follow(frames, source, begin, Following(**following), live=True)
         return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
+
+
+def _rotor_start_s(course: Course, start: object, rate_hz: float) -> float:
+    """Return the seconds in which the periods of a rotor's start are: known of an excitation that is played, else they
+    are looked for from time to time.
+    """
+    if isinstance(start, (int, float)):
+        return start
+    if isinstance(course.program, AxesProgram):
+        return (_IDENTIFIED_PERIODS if start is None else _CHECKED_PERIODS) * len(course.program.wave) / rate_hz
+    return min(_LOOKED_S, course.seconds / 3.0)
 
 
 class _Lead:
     """The beginning of the stream: read before tracking begins, and tracked with the rest."""
 
     def __init__(self, frames: Iterator[Frame], runner: LiveRun, wanted_s: float, view: BenchView, port: str) -> None:
-        self._frames, read = frames, list[Block]()
-        wanted = round(wanted_s * view.rate_hz) + 1
+        self._frames, self._blocks, self._view, self._port = frames, list[Block](), view, port
+        if not self.read(wanted_s):
+            raise _too_short(runner, wanted_s, view.rate_hz)
+
+    def read(self, until_s: float) -> bool:
+        """Read on; whether there was as much."""
+        read, wanted = self._blocks, round(until_s * self._view.rate_hz) + 1
         while not read or read[-1].first + len(read[-1].values) < wanted:
             frame = next(self._frames, None)
             if frame is None:
-                raise _too_short(runner, wanted_s, view.rate_hz)
+                return False
             read.append(frame.block)
+        return True
+
+    @property
+    def source(self) -> BenchRows:
+        """What was read."""
+        read, view = self._blocks, self._view
         values = np.concatenate([b.values for b in read])
         numbers = np.concatenate([b.first + np.arange(len(b.values)) for b in read])
         stamps = np.concatenate([b.time_s + np.arange(len(b.values)) / view.rate_hz for b in read])
         channels = tuple(
             Channel(name=role, unit=unit, values=values[:, k]) for k, (role, unit) in enumerate(view.units.items())
         )
-        provenance = MappingProxyType({"file": port})
-        self.source = BenchRows(
+        provenance = MappingProxyType({"file": self._port})
+        return BenchRows(
             record=Record(channels=channels, rate_hz=view.rate_hz, provenance=provenance, history=(SELECTED,)),
             replay=Replay(
                 values=values, numbers=numbers, time_s=stamps, rate_hz=view.rate_hz, block_samples=_BLOCK_SAMPLES
@@ -122,10 +166,23 @@ class _Lead:
             forcing=None, t0=0.0,
         )  # fmt: skip
 
-    def frames(self, first: int, on_lag: Callable[[float], object]) -> Iterator[Frame]:
-        """Yield what was read, from a number on, and then what comes; what waited for the start counts from now."""
+    def periodic(self, rig: Rig, most_s: float) -> BenchRows:
+        """Read on until the periods of a rotor's start are there; return what was read."""
+        source, periods = self.source, 0
+        while periods <= _CHECKED_PERIODS and source.duration_s < most_s:
+            if not self.read(source.duration_s + _LOOKED_S):
+                break
+            source = self.source
+            found = find_excitation(source.record, rig.plant)
+            periods = 0 if found is None else found.count
+        return source
+
+    def frames(self, source: BenchRows | None, first: int, on_lag: Callable[[float], object]) -> Iterator[Frame]:
+        """Yield what was read (`source`), from a number on, and then what comes; what waited for the start counts from
+        now.
+        """
         began = time.perf_counter()
-        for block in self.source.replay.since(first):
+        for block in () if source is None else source.replay.since(first):
             yield Frame(block=block, arrived_s=began)
         for frame in self._frames:
             yield replace(frame, arrived_s=max(frame.arrived_s, began))

@@ -5,27 +5,39 @@ Read -> start (an estimate, or one identified from the first periods) -> filter 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ambid.arrays import Array, Complex
+from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.margins import sensitivity_by_axis
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import plain_json
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick
+from ambid.job.closed_loop import controller_of, loop_and_peaks, measure, refuse_unstable
 from ambid.job.data import Reading, Source, load_bench, origin
 from ambid.job.following import Following, tell
 from ambid.job.rotor import identify_rotor
+from ambid.job.track_start import BenchRows
+from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Experiment, Point, noise_weight
-from ambid.rotor.spectra import Excitation, find_excitation, period_spectra
-from ambid.rotor.synchronous import separate
+from ambid.rotor.spectra import Excitation, PeriodSpectra, find_excitation, period_spectra
+from ambid.rotor.synchronous import rotation_of, separate, synchronous_response, without_synchronous
 from ambid.rotor.unknowns import Unknowns
 from ambid.settings.caller import saved, setting
+from ambid.tracking.blocks import Block as Samples
+from ambid.tracking.blocks import Frame
 from ambid.tracking.rotor_filter import Block, RotorFilter, State
 
 _START = 4  # periods from which a start is identified, where the record has three times as many
@@ -34,6 +46,9 @@ _AGE = ("k_i", "k_x", "R")
 _OF_MODES = {"omega": ("frequency", "Hz", 0.5 / np.pi), "zeta": ("damping", "1", 1.0)}
 _SPEED = 0.01  # relative difference of speeds
 _RATE = 1e-6  # of rates
+_LIVE_LINES = 400  # of a live filter, beside those of modes:
+_NEAR, _WIDTHS = 0.08, 5.0  # all within so much of their frequency, or half widths; levitated they stand elsewhere
+_JUDGED_S = 10.0  # between two sensitivities of a live loop
 
 
 def track_rotor(
@@ -67,30 +82,206 @@ def track_rotor(
     whole = Experiment(spectra=replace(spectra, between=head.between), speed=speed)
     with one_thread():
         follower, size = _filter(estimate, rig, bench, whole, n, how), _size(how, bench, excitation.period)
-        header = TrackHeader(
-            rate_hz=bench.rate_hz, limit=how.limit, method=f"periods, memory {how.memory}", model="rotor",
-            every_s=size * excitation.period / bench.rate_hz, units=_units(follower),
-            start=_values(follower, stale=False),
-            record={**origin(bench), "samples": (excitation.count - first) * excitation.period},
-            warnings=tuple(r.text for r in estimate.verdict.reasons) if start is None else (),
-        )  # fmt: skip
+        samples = (excitation.count - first) * excitation.period
+        header = _header(follower, bench, excitation, size, samples, how, estimate if start is None else None)
         say("track")
-        return tell(header, _lines(follower, whole, excitation, first, size), how)
+        blocks = (
+            _block(whole, spectra.U[k : k + size], spectra.Y[k : k + size], excitation.first + k * excitation.period)
+            for k in range(first, excitation.count - size + 1, size)
+        )
+        return tell(header, (_line(follower, block) for block in blocks), how)
 
 
-def _lines(
-    follower: RotorFilter, whole: Experiment, excitation: Excitation, first: int, size: int
-) -> Iterator[TrackLine]:
-    for k in range(first, excitation.count - size + 1, size):
-        spectra = replace(whole.spectra, U=whole.spectra.U[k : k + size], Y=whole.spectra.Y[k : k + size])
-        at = excitation.first + k * excitation.period
-        block = Block(experiment=replace(whole, spectra=spectra), first=at, last=at + size * excitation.period)
-        step = follower.take(block)
-        yield TrackLine(
-            t=follower.t0 + block.last / follower.rate_hz, parameters=_values(follower, stale=not step.used),
-            error=step.error, state="tracking" if step.settled else "changed",
-            events=tuple(_told(e) for e in step.events),
-        )  # fmt: skip
+def follow_rotor(
+    lead: BenchRows,
+    frames: Iterator[Frame],
+    rig: Rig,
+    start: object,
+    how: Following,
+    *,
+    on_lag: Callable[[float], object],
+    on_loop: Callable[[float, Mapping[str, Any]], object],
+) -> Track:
+    """Follow a rotor in a stream from its first periods on, which identify a start unless there is one. `on_loop`: told
+    the time and the sensitivity of each axis, as an estimate has it: measured in the run, without an excitation
+    predicted by the start.
+    """
+    bench, model, identified = lead.record, rig.rotor, start is None or isinstance(start, (int, float))
+    assert model is not None
+    if np.any(np.diff(lead.replay.numbers) != 1) or not np.isfinite(lead.replay.values).all():
+        raise EstimationError("samples of the first periods are missing; a start needs all of them. Start again")
+    try:
+        excitation = _excitation(bench, rig)
+    except EstimationError:
+        if not identified:  # what can be said of the loop without an excitation
+            known = _given(start, rig, bench.rate_hz, model.speed)
+            on_loop(bench.start_s, loop_and_peaks(known, rig, bench, None, model.speed)[1])
+        raise
+    n, period, still = excitation.count, excitation.period, separate(bench, model)
+    excitation = replace(excitation, first=excitation.first - excitation.first % period)  # the rest is of the next one
+    first = excitation.first + n * period
+    if identified:
+        estimate = identify_rotor([_periods(bench, excitation, 0, n)], rig)
+    else:
+        estimate = _given(start, rig, bench.rate_hz, still.speed)
+    every = Experiment(spectra=period_spectra(still.record, model, excitation, still.speed), speed=still.speed)
+    keep = _telling(every.spectra, estimate, len(model.axes))
+    whole = replace(every, spectra=every.spectra.lines(keep))
+    with one_thread():
+        follower, size = _filter(estimate, rig, bench, whole, n, how), _size(how, bench, period)
+        stream = _Stream(bench, int(lead.replay.numbers[0]), first, period, size)
+        judge = _Judge(follower, estimate, rig, every, on_loop)
+
+        def lines() -> Iterator[TrackLine]:
+            judge(first)
+            for at, window, arrived_s in stream.windows(frames):
+                if window is None:
+                    yield _missing(follower, at, size * period)
+                    continue
+                U, Y = _spectra_of(window, model, every, size)
+                yield _line(follower, _block(whole, U[:, keep], Y[:, keep], at))
+                on_lag(time.perf_counter() - arrived_s)
+                judge.take(U, Y, at + size * period)
+
+        header = _header(follower, bench, excitation, size, None, how, estimate if identified else None)
+        return tell(header, lines(), how)
+
+
+def _missing(follower: RotorFilter, at: int, samples: int) -> TrackLine:
+    """Return the line of a block that is not whole: the last values."""
+    why = "samples of this block, or of the one before it, are missing"
+    event = Event(kind="rejected", t=follower.time(at), why=why, samples=samples)
+    values, t = _values(follower, stale=True), follower.time(at + samples)
+    return TrackLine(t=t, parameters=values, error=np.nan, state="frozen", events=(event,))
+
+
+def _telling(spectra: PeriodSpectra, estimate: RotorEstimate, axes: int) -> NDArray[np.bool_]:
+    """Return which lines a filter beside a run takes: those of bending modes, and of the others, which are dealt out to
+    the axes, as many to the octave.
+    """
+    f = spectra.frequency_hz
+    groups = np.arange(f.size) // axes
+    keep = np.isin(groups, np.unique(np.geomspace(1, groups[-1] + 1, _LIVE_LINES // axes).astype(int)) - 1)
+    for r in range(1, estimate.n_modes + 1):
+        hz = estimate.numbers[f"mode{r}.omega"] / (2.0 * np.pi)
+        keep |= np.abs(f - hz) < hz * max(_NEAR, _WIDTHS * estimate.numbers[f"mode{r}.zeta"])
+    return np.asarray(keep)
+
+
+class _Stream:
+    """Cuts a stream into windows of a period and the `size` periods after it, aligned with those of the start."""
+
+    def __init__(self, lead: Record, origin: int, first: int, period: int, size: int) -> None:
+        self._lead, self._period, self._size = lead, period, size
+        tail = np.column_stack([c.values for c in lead.channels])[first - period :]
+        self._rows, self._n, self._at = [tail], len(tail), first
+        self._next = origin + lead.n_samples
+
+    def windows(self, frames: Iterator[Frame]) -> Iterator[tuple[int, Record | None, float]]:
+        """Yield where the last periods of a window begin, the window, None where samples are missing, and when its end
+        was there.
+        """
+        new, whole = self._size * self._period, (self._size + 1) * self._period
+        for frame in frames:
+            self._take(frame.block)
+            while self._n >= whole:
+                rows = np.concatenate(self._rows)
+                self._rows, self._n = [rows[new:]], len(rows) - new
+                sound = bool(np.isfinite(rows[:whole]).all())
+                yield self._at, self._record(rows[:whole]) if sound else None, frame.arrived_s
+                self._at += new
+
+    def _take(self, block: Samples) -> None:
+        lost, seen = block.first - self._next, max(0, self._next - block.first)
+        values = block.values[seen:]
+        if lost > 0:
+            values = np.concatenate([np.full((lost, values.shape[1]), np.nan), values])
+        self._rows.append(values)
+        self._n += len(values)
+        self._next += len(values)
+
+    def _record(self, rows: Array) -> Record:
+        start_s = self._lead.start_s + (self._at - self._period) / self._lead.rate_hz
+        channels = tuple(replace(c, values=rows[:, k].copy()) for k, c in enumerate(self._lead.channels))
+        return replace(self._lead, channels=channels, start_s=start_s)
+
+
+def _spectra_of(window: Record, model: RotorModel, whole: Experiment, size: int) -> tuple[Complex, Complex]:
+    """Return the spectra of the last periods of a window at the lines of the start, without what turns with the rotor,
+    which the period before them helps to tell.
+    """
+    spectra, run = whole.spectra, Excitation(period=whole.spectra.period, first=0, count=size + 1)
+    rotation = rotation_of(window, replace(model, speed=whole.speed), run) if whole.speed else None
+    if rotation is not None:
+        roles = (*model.inputs, *model.outputs)
+        window = without_synchronous(window, synchronous_response(window, roles, rotation, run))
+    bins = np.round(spectra.frequency_hz * run.period / window.rate_hz).astype(int)
+
+    def of(roles: Sequence[str]) -> Complex:
+        x = np.column_stack([window[role].values[run.period :] for role in roles])
+        return np.asarray(np.fft.rfft(x.reshape(size, run.period, -1), axis=1)[:, bins] / run.period)
+
+    return of(model.inputs), of(model.outputs)
+
+
+class _Judge:
+    """Tells the sensitivity of the loop from time to time, by the numbers of the filter and the last periods."""
+
+    def __init__(
+        self, follower: RotorFilter, estimate: RotorEstimate, rig: Rig, whole: Experiment,
+        on_loop: Callable[[float, Mapping[str, Any]], object],
+    ) -> None:  # fmt: skip
+        self._follower, self._estimate, self._rig, self._on_loop = follower, estimate, rig, on_loop
+        self._spectra, self._keep = whole.spectra, whole.spectra.n_periods
+        self._last = 0
+
+    def take(self, U: Complex, Y: Complex, at: int) -> None:
+        """Take the spectra of the last periods; `at`: the sample after them."""
+        s = self._spectra
+        self._spectra = replace(s, U=np.concatenate([s.U, U])[-self._keep :], Y=np.concatenate([s.Y, Y])[-self._keep :])
+        if at - self._last >= _JUDGED_S * s.rate_hz:
+            self(at)
+
+    def __call__(self, at: int) -> None:
+        self._last, f = at, self._follower
+        names, covariance = f.covariance()
+        rotor = f.unknowns.model
+        plant = Plant.of(rotor, f.point.theta, self._estimate.delay, self._spectra.rate_hz, names, covariance)
+        try:
+            loop = ClosedLoop.of(plant, controller_of(plant, self._rig, self._spectra))
+            refuse_unstable(loop, self._rig)
+        except EstimationError:  # as an estimate, which has then no sensitivity
+            return
+        found = sensitivity_by_axis(loop, measure(loop, None, self._spectra))
+        self._on_loop(f.t0 + at / f.rate_hz, plain_json(found))
+
+
+def _line(follower: RotorFilter, block: Block) -> TrackLine:
+    step = follower.take(block)
+    return TrackLine(
+        t=follower.t0 + block.last / follower.rate_hz, parameters=_values(follower, stale=not step.used),
+        error=step.error, state="tracking" if step.settled else "changed",
+        events=tuple(_told(e) for e in step.events),
+    )  # fmt: skip
+
+
+def _block(whole: Experiment, U: Complex, Y: Complex, at: int) -> Block:
+    """Return spectra of periods (n_periods, n_lines, n) from a sample on as one measurement."""
+    experiment = replace(whole, spectra=replace(whole.spectra, U=U, Y=Y))
+    return Block(experiment=experiment, first=at, last=at + len(U) * whole.spectra.period)
+
+
+def _header(
+    follower: RotorFilter, bench: Record, excitation: Excitation, size: int, samples: int | None, how: Following,
+    identified: RotorEstimate | None,
+) -> TrackHeader:  # fmt: skip
+    """Return the header of a track; `identified`: the start, where it was made from the record."""
+    return TrackHeader(
+        rate_hz=bench.rate_hz, limit=how.limit, method=f"periods, memory {how.memory}", model="rotor",
+        every_s=size * excitation.period / bench.rate_hz, units=_units(follower),
+        start=_values(follower, stale=False), record={**origin(bench), "samples": samples},
+        warnings=() if identified is None else tuple(r.text for r in identified.verdict.reasons),
+    )  # fmt: skip
 
 
 def _filter(estimate: RotorEstimate, rig: Rig, bench: Record, whole: Experiment, n: int, how: Following) -> RotorFilter:
@@ -152,16 +343,21 @@ def _periods(bench: Record, excitation: Excitation, first: int, count: int) -> R
     return replace(bench, channels=channels, start_s=bench.start_s + a / bench.rate_hz)
 
 
-def _given(start: object, rig: Rig, rate_hz: float, speed: float) -> RotorEstimate:
-    """Return a start that was given, or read from its file; refuse that of another machine, rate or speed."""
+def given_start(start: object) -> RotorEstimate:
+    """Return an estimate of a rotor, read from its file where it is none."""
     from ambid.job.results import load
 
-    if isinstance(start, (str, Path)):
-        start = load(start)
-    if not isinstance(start, RotorEstimate):
+    found = load(start) if isinstance(start, (str, Path)) else start
+    if not isinstance(found, RotorEstimate):
         raise EstimationError(
             f"the start is no estimate of a rotor. Give {saved('identify')} for a rig with [bearings.X]"
         )
+    return found
+
+
+def _given(start: object, rig: Rig, rate_hz: float, speed: float) -> RotorEstimate:
+    """Return a start that was given, or read from its file; refuse that of another machine, rate or speed."""
+    start = given_start(start)
     assert rig.rotor is not None
     model = rig.rotor.with_modes(start.n_modes).at_speed(speed)
     missing = next((p.name for p in model.parameters if p.name not in start.numbers), None)

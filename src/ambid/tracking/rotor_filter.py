@@ -77,7 +77,7 @@ class Step:
 @dataclass(slots=True, kw_only=True, eq=False)
 class RotorFilter:
     """Follow a rotor through blocks; `ages`: whether each of `unknowns.names` moves; `weight`: of a block; `memory`: in
-    blocks, None: found from the data; `time`: seconds at a sample of the record.
+    blocks, None: found from the data.
     """
 
     unknowns: Unknowns
@@ -121,9 +121,14 @@ class RotorFilter:
 
     def sd(self) -> Mapping[str, float]:
         """Return the standard deviations of all numbers, SI."""
-        _, chain = self.unknowns.chain(self.best.state.q)
-        P = chain @ self.best.state.P @ chain.T
-        return dict(zip(self.unknowns.names, np.sqrt(np.diag(P)).tolist(), strict=False))
+        names, P = self.covariance()
+        return dict(zip(names, np.sqrt(np.diag(P)).tolist(), strict=True))
+
+    def covariance(self) -> tuple[tuple[str, ...], Array]:
+        """Return the names of all numbers and their covariance, SI."""
+        names, chain = self.unknowns.chain(self.best.state.q)
+        chain = chain[: len(names)]
+        return tuple(names), chain @ self.best.state.P @ chain.T
 
     def take(self, block: Block) -> Step:
         """Take in a block."""
@@ -157,7 +162,7 @@ class RotorFilter:
     def _confirmed(self, block: Block) -> tuple[Event, ...]:
         """Say that numbers which jumped explain a further block."""
         names, self._open = self._open, ()
-        t = self._time(block.last)
+        t = self.time(block.last)
         return tuple(Event(kind="accepted", parameter=n, t=t, why=f"{n} explains one more block") for n in names)
 
     def _changed(self, window: Sequence[Block], error: float, alarm: Alarm | None) -> Step:
@@ -183,7 +188,7 @@ class RotorFilter:
                     why = (
                         f"noise is {alarm.noise:.2f} times as much as before (variance), with the numbers as they were"
                     )
-            event = Event(kind="disturbed", t=self._time(last.last), why=why)
+            event = Event(kind="disturbed", t=self.time(last.last), why=why)
             events = (event,) if why else self._confirmed(last)
         for m in self._bank:
             m.state = fitted
@@ -195,7 +200,7 @@ class RotorFilter:
     def _unexplained(self, block: Block, error: float) -> Step:
         """Leave a block out that no numbers explain."""
         self._doubt += 1
-        n, t = block.last - block.first, self._time(block.last)
+        n, t = block.last - block.first, self.time(block.last)
         why = "no values of the numbers that age explain this block: a change within it, or a disturbance"
         events = [Event(kind="rejected", t=t, why=why, samples=n)]
         if self._doubt == _UNEXPLAINED:
@@ -206,7 +211,7 @@ class RotorFilter:
     def _told(self, names: Sequence[str], statistics: Array, after: State, before: State) -> tuple[Event, ...]:
         now, then = (self._problem(None).point(s.q).theta for s in (after, before))
         assert self._since is not None
-        events, t = [], self._time(self._since)
+        events, t = [], self.time(self._since)
         sds = np.sqrt(np.diag(before.P) + np.diag(after.P))
         for name, statistic in zip(names, statistics.tolist(), strict=True):
             size, sd = now[name] / then[name] - 1.0, float(sds[self.unknowns.names.index(name)])
@@ -290,7 +295,8 @@ class RotorFilter:
             n_samples=rows.shape[0] - n, n_outputs=1, last=block.last,
         )  # fmt: skip
 
-    def _time(self, sample: int) -> float:
+    def time(self, sample: int) -> float:
+        """Return the seconds at a sample."""
         return self.t0 + sample / self.rate_hz
 
 

@@ -422,7 +422,7 @@ def _check_units(record: Record, rig: Rig, where: str) -> None:
             continue
         counts = "1" if rig.daq is not None else channel.unit  # a gain of a controller's rig is for counts
         unit = wanted.get(c.role, channel.unit) if calibration is None else calibration.unit_in or counts
-        if channel.unit != unit:
+        if unit not in (channel.unit, "?"):  # any unit
             raise DeviceError(
                 f"{where}: column {c.column!r} is in [{channel.source_unit or channel.unit}]; channels.{c.role} of the"
                 f" rig takes [{unit}]{', counts' if unit == '1' else ''}. Replay it with the rig that it was taken"

@@ -54,7 +54,7 @@ async function look() {
   const host = el("div");
   rows = []; said = { ledger: form.ledger.value };
   put($("fleet-view"), host);
-  await job({ job: "fleet", ledger: Number(form.ledger.value) }, host, (m) => { if (m.kind === "bearings") rows.push(...m.rows); })
+  await job({ job: "fleet", ledger: Number(form.ledger.value) }, (m) => { if (m.kind === "bearings") rows.push(...m.rows); })
     .then(draw).catch(wrong(host));
 }
 form.state.append(...GRAVE.map((s) => el("option", { value: s }, STATES[s][0])));

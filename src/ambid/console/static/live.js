@@ -4,6 +4,7 @@ import { $, el, feed, LATE_S, put, seconds, shown, SLOTS, state, stem } from "./
 import { job, wrong } from "./files.js";
 import { refresh } from "./lists.js";
 import { chart, css, fill, Group, ink, line, narrow, orbit, Spectra, strip, waterfall } from "./plot.js";
+import { RotorView } from "./rotor.js";
 import { orderWords, Watched } from "./run.js";
 import { banner, pose, question, stop } from "./stop.js";
 import { sections, verdict } from "./tables.js";
@@ -39,6 +40,7 @@ export class Live extends Watched {
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; },
       header: () => this.start(m), line: () => this.take(m), spectrum: () => this.hear(m),
+      rotor: () => { this.rotor ??= new RotorView(m); }, orbits: () => this.rotor?.take(m), loop: () => this.rotor?.judge(m),
       event: () => this.event(m.t, m.what, m.why), alarm: () => this.event(m.t, m.what, m.why),
       told: () => m.events.forEach((e) => this.event(e.t, e.what, e.why)), before: () => m.events.forEach((e) => this.tell(e)),
       device: () => this.event(m.sample === null ? null : m.sample / (this.signals?.rate_hz ?? NaN), m.what, m.text),
@@ -73,7 +75,7 @@ export class Live extends Watched {
     choice.onchange = () => this.drawFall(); this.fallOf = choice;
     $("spectrum").append(this.open);
     const two = m.names.map((n, k) => [n, k]).filter(([n]) => n.endsWith("position")).slice(0, 2);
-    if (two.length > 1) {
+    if (two.length > 1 && !this.rotor) {  // a rotor has an orbit in each bearing
       this.ring = orbit(`Orbit, middles of ${seconds(m.group / m.rate_hz)}: what is faster is averaged`, 260);
       this.ringOf = two; $("orbit").append(this.ring.box);
     }
@@ -105,7 +107,8 @@ export class Live extends Watched {
     for (const [name, v] of Object.entries(m.start)) {
       const made = chart(name, 92, [line("transparent"), line("transparent"), line(ink("--accent"), { width: 1.6 }),
         line(ink("--dim"), { dash: [4, 4] })], m.units[name], { bands: [fill(1, "--accent", "33")], main: 3, group: this.group,
-        meaning: m.meanings?.[name], marks: () => this.alarms.marks, kind: "value; drawn with its 95 % band, dashed the start",
+        meaning: m.meanings?.[name] ?? m.meanings?.[name.split(".").at(-1)],  // of a rotor that of every axis
+        marks: () => this.alarms.marks, kind: "value; drawn with its 95 % band, dashed the start",
         read: (k) => { const [, low, high, v] = made.plot.data; return shown(v[k], m.units[name], (high[k] - low[k]) / 3.92); } });
       $("parameters").append(made.box);
       this.parameters[name] = { ...made, start: v.value, unit: m.units[name], band: [[], [], []] };
@@ -172,6 +175,7 @@ export class Live extends Watched {
     if (feed !== this) return;
     if (!this.frozen && !stop && !$("live").hidden) {  // nothing is drawn while a stop is on its way
       if (this.dirty) this.drawStrips(...this.window());
+      if (this.rotor?.dirty) this.rotor.draw();
       if (this.dirtyLines) this.drawLines(...this.window());
       if (this.spectrum && this.spectra) this.drawSpectrum();
       this.dirty = this.dirtyLines = false;
@@ -192,6 +196,7 @@ export class Live extends Watched {
     const n = z - a, step = Math.max(1, Math.ceil(n / SLOTS));
     const t = step === 1 ? this.t.slice(a, z) : pick(this.t, a, z, step, (x) => x[0]);
     this.strips.forEach((s, k) => {
+      if (!this.frozen && !inSight(s.box)) return;
       const low = step === 1 ? this.low[k].slice(a, z) : pick(this.low[k], a, z, step, (x) => Math.min(...x)),
         high = step === 1 ? this.high[k].slice(a, z) : pick(this.high[k], a, z, step, (x) => Math.max(...x));
       s.plot.batch(() => { s.plot.setData([t, low, high], false); s.plot.setScale("x", { min: from, max: Math.max(end, from + 0.1) }); });
@@ -247,6 +252,9 @@ export class Live extends Watched {
     if (this.error) this.error.say(last.error === null ? "unknown" : last.error.toFixed(2));
   }
 }
+// A moving strip out of sight is not drawn: of a rotor there are many.
+const inSight = (box) => { const at = box.getBoundingClientRect(); return at.bottom > 0 && at.top < innerHeight; };
+for (const moved of ["scroll", "resize"]) addEventListener(moved, () => { if (feed?.t?.length) feed.dirty = true; }, { passive: true });
 const SD = "± is one standard deviation (sd), bands are 95 %, dashed: the start. A name's meaning shows under the pointer.";
 const turns = () => Number($("speed").value) > 0 ? [Number($("speed").value) / 60] : [];  // a second
 for (const button of document.querySelectorAll("[data-say]")) {

@@ -11,6 +11,7 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 function colours() {
   document.documentElement.toggleAttribute("data-dark", $("theme").value ? $("theme").value === "dark" : dark.matches);
   recolour();
+  feed?.rotor?.draw();
 }
 
 $("theme").value = document.cookie.match(/(?:^|; )ambid_colours=(light|dark)/)?.[1] ?? "";
