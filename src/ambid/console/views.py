@@ -40,6 +40,7 @@ def preview(
         drafted = ""
         note(str(refusal))
     yield "preview", {
+        "channels": [{"name": c.name, "unit": c.unit} for c in record.channels],
         "rate_hz": record.rate_hz, "samples": record.n_samples, "draft": drafted,
         "content": content(inspect(record, guess=guess(record))),
     }  # fmt: skip
