@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ambid.fleet.run import fleet as fleet
     from ambid.job import acquire as acquire
     from ambid.job import compare as compare
+    from ambid.job import demo as demo
     from ambid.job import design_controller as design_controller
     from ambid.job import design_experiment as design_experiment
     from ambid.job import fit as fit
@@ -64,4 +65,10 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("ambid")
-    return import_module(f"ambid.{name}") if name in _ROOMS else _exported(name)
+    if name in _ROOMS:
+        return import_module(f"ambid.{name}")
+    if name not in __all__ and not name.startswith("_"):
+        from ambid.settings.elsewhere import PACKAGE, missing
+
+        raise missing("ambid", name, __dir__(), PACKAGE)
+    return _exported(name)

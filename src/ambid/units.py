@@ -13,7 +13,7 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,12 @@ class Unit:
         if self.scale < 1.0 and (inverse := round(1.0 / self.scale)) * self.scale == 1.0:
             return x / inverse  # 60.54 g is 0.06054 kg exactly as decimals, not 0.06054000000000001
         return x * self.scale
+
+    def of_si(self, x: Any, si: str) -> Any:
+        """Return values in SI units `si` in this unit; UnitError where that is of another kind."""
+        if parse_unit(si).si != self.si:
+            raise UnitError(f"[{si}] cannot be told in [{self.symbol}]. Give a unit of the same kind")
+        return x / self.scale
 
 
 @lru_cache(maxsize=256)

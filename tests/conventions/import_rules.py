@@ -33,6 +33,7 @@ TIERS: tuple[tuple[str, ...], ...] = (
 ASKED = {
     ("ambid.estimation.result", "ambid.job.presentation"),
     ("ambid.estimation.result", "ambid.job.prediction"),
+    ("ambid.record.record", "ambid.record"),
     ("ambid.record.record", "ambid.record.frames"),
     ("ambid.record.record", "ambid.report.record"),
 }

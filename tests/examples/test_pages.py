@@ -25,8 +25,13 @@ def blocks(page: Path, language: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("page", "printed"),
-    [("howto", "k_i with the mass free"), ("online", "k_i changed at 1.5")],
-    ids=["howto", "online"],
+    [
+        ("howto", "k_i with the mass free"),
+        ("online", "k_i changed at 1.5"),
+        ("from_matlab", "one_machine"),
+        ("from_python_control", "the plant is unstable in open loop"),
+    ],
+    ids=["howto", "online", "from_matlab", "from_python_control"],
 )
 def test_python_pieces_of_a_page_run_in_their_order(page, printed, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.resources import as_file, files
+from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any
 
@@ -29,20 +29,15 @@ def command() -> None:
 
     The record: 0.4 s of an unstable bearing levitated by a PID controller, simulated with noise. No parameter is given.
     """
-    from ambid.job.identification import identify_axis
+    from ambid.job.identification import demo
     from ambid.physics.presets import preset
     from ambid.report.document import Checks, Lines, Section, sections_text
     from ambid.report.estimate import delay_lines, header, output_table
     from ambid.report.parameters import calibration_lines
     from ambid.report.text import verdict_lines
-    from ambid.rig import load_rig
 
-    with (
-        as_file(demo_file("demo.csv.gz")) as record,
-        as_file(demo_file("demo.toml")) as rig,
-        progress("identify") as tick,
-    ):
-        estimate = identify_axis(record, load_rig(rig), tick=tick)
+    with progress("identify") as tick:
+        estimate = demo(tick=tick)
     paint = painter()
     truth = preset(PRESET).parameters
     whole = sum(estimate.timing_s.values())

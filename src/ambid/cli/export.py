@@ -20,13 +20,13 @@ def command(v: Values) -> None:
     """
     from ambid.errors import EstimationError
     from ambid.estimation.result import Linear
-    from ambid.job import load
     from ambid.job.exchange import write_plant
     from ambid.job.files import EXPORT_ENDINGS
+    from ambid.job.results import load_result
 
     with Outputs(v.result) as outputs:
         outputs.claim(v.out, "out", EXPORT_ENDINGS, force=v.force)
-        found = load(v.result)
+        found = load_result(v.result)
         if not isinstance(found, Linear):
             raise EstimationError(
                 f"{v.result} holds no linear plant. Give an estimate, or the fit of a linear structure"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import math
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import lru_cache
 from pathlib import PurePath
@@ -18,60 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, EstimationError, nearest
+from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.global_search import describe_search
+from ambid.estimation.parameters import EstimatedParameter as EstimatedParameter
+from ambid.estimation.parameters import Parametric as Parametric
 from ambid.estimation.result import NORMAL_95, Linear, Predicting, Reason, Result, Simulating
-from ambid.physics.linear_model import LinearModel, Parameter, model
+from ambid.physics.linear_model import LinearModel, model
 from ambid.settings.caller import command, saved
 
 _ROUNDING = 1e-9  # samples
 _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class EstimatedParameter:
-    """One parameter as estimated."""
-
-    name: str  # name and SI unit
-    unit: str
-    value: float  # SI; `sd` is 0 for a fixed parameter
-    sd: float
-    ci95: tuple[float, float]  # 95 % interval, value -+ 1.96 sd
-    role: Literal["free", "fixed", "prior"]
-    # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
-    identifiable: bool
-    data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
-    sd_calibrated: float | None = None  # with what the rig says of calibration; None where it says nothing
-    ci95_calibrated: tuple[float, float] | None = None
-
-    def __repr__(self) -> str:
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        spread = f" ± {self.sd:.2g}{unit}, 95 % interval {self.ci95[0]:.4g} … {self.ci95[1]:.4g}" if self.sd else unit
-        return f"<{self.name} = {self.value:.5g}{spread}, {self.role}>"
-
-    @classmethod
-    def of(
-        cls,
-        p: Parameter,
-        theta: Mapping[str, float],
-        sd: Mapping[str, float],
-        identifiable: Mapping[str, bool],
-        alone: Mapping[str, float] | None = None,
-    ) -> EstimatedParameter:
-        """Return a parameter as estimated; `alone`: standard deviations of the data alone, for the share of a prior."""
-        value, spread, share = theta[p.name], sd.get(p.name, 0.0), None
-        if alone is not None and p.role == "prior" and p.sd:
-            share = float(1 / (1 + (alone[p.name] / p.sd) ** 2))
-        return cls(
-            name=p.name,
-            unit=p.unit,
-            value=value,
-            sd=spread,
-            ci95=(value - NORMAL_95 * spread, value + NORMAL_95 * spread),
-            role=p.role,
-            identifiable=identifiable.get(p.name, True),
-            data_share=share,
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,34 +125,6 @@ class Judged(Result):
         second = (getattr(self, "validation", None) or {}).get("checks", {})
         failed += [Reason(check=f"validation.{k}", text=c["detail"]) for k, c in second.items() if not c["passed"]]
         return tuple(failed)
-
-
-class Parametric:
-    """A result that has named parameters."""
-
-    __slots__ = ()
-    parameters: tuple[EstimatedParameter, ...]
-
-    def __getitem__(self, name: str) -> EstimatedParameter:
-        return self.parameter(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.values)
-
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameter values, SI."""
-        return {p.name: p.value for p in self.parameters}
-
-    def parameter(self, name: str) -> EstimatedParameter:
-        """Return one parameter by name; EstimationError where there is none of that name."""
-        for p in self.parameters:
-            if p.name == name:
-                return p
-        names = [p.name for p in self.parameters]
-        raise EstimationError(
-            f"the estimate has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

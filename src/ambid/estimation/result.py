@@ -4,12 +4,15 @@ Only `_shown` and `_predicted`, through which methods ask for texts and figures,
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+from ambid.settings.elsewhere import RESULT, missing
 
 if TYPE_CHECKING:
     import pandas
@@ -133,7 +136,7 @@ class Result:
         """
         return str(_shown("text")(self, width=width))
 
-    def plot(self, record: object = None) -> Figure:
+    def plot(self, record: object = None, *, ax: Any = None) -> Figure:
         """Draw the result, with the verdict above.
 
         Parameters
@@ -141,12 +144,15 @@ class Result:
         record : object, optional
             Record to draw beside it, as the function of the verb takes it. Default: the one that it was made from;
             without any (a result that was read from a file) what needs none is drawn.
+        ax : matplotlib axes or several, optional
+            To draw into: as many panels, the first ones, as there are axes; nothing else of their figure is touched.
 
         Returns
         -------
         matplotlib.figure.Figure
+            Nothing opens a window: a notebook displays the last line of a cell.
         """
-        figure: Figure = _shown("figure")(self, record)
+        figure: Figure = _shown("figure")(self, record, ax)
         return figure
 
     def report(self, path: str | Path, record: object = None) -> None:
@@ -171,6 +177,16 @@ class Result:
         """
         _shown("write_document")(self, path)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `save` writes, as plain values that `json` takes.
+
+        Returns
+        -------
+        dict
+        """
+        document: dict[str, Any] = json.loads(_shown("document")(self))
+        return document
+
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the result as a table; needs pandas.
 
@@ -181,6 +197,13 @@ class Result:
         """
         table: pandas.DataFrame = _shown("dataframe")(self)
         return table
+
+    if not TYPE_CHECKING:  # an editor and a type checker know the attributes alone
+
+        def __getattr__(self, name: str) -> object:
+            if name.startswith("_"):
+                raise AttributeError(name)
+            raise missing(f"a {type(self).__name__}", name, dir(self), RESULT)
 
     def __repr__(self) -> str:
         return str(_shown("line")(self))
@@ -195,8 +218,14 @@ class Predicting:
 
     __slots__ = ()
 
+    @property
+    def residuals(self) -> pandas.DataFrame:
+        """Innovations on the record that it was made from: ``name [unit]`` by output, over time in s, SI."""
+        table: pandas.DataFrame = _predicted("residuals")(self)
+        return table
+
     def predict(
-        self, record: Any, *, ahead: int = 1, rate_hz: float | None = None, units: Mapping[str, str] | None = None
+        self, record: Any, ahead: int = 1, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None
     ) -> dict[str, Array]:
         """Predict the outputs of a record some samples ahead; nothing but offsets and initial state is fitted.
 
@@ -244,13 +273,19 @@ class Simulating:
 
         Parameters
         ----------
-        u : ndarray, shape (n_samples,) or (n_samples, n_inputs), SI
-            Inputs, at the rate of the record that the model came from.
+        u : ndarray, shape (n_samples,) or (n_samples, n_inputs), SI; or Record, file or table
+            Inputs, at the rate of the record that the model came from, or a record that has them. Where the plant is
+            unstable and the rig has a [loop], what is added to the controller's output: of a record its ``reference``.
 
         Returns
         -------
         dict of str to ndarray, shape (n_samples,), SI
-            By output. An unstable plant runs away.
+            By output.
+
+        Raises
+        ------
+        EstimationError
+            If the plant is unstable and no loop is known.
         """
         outputs: dict[str, Array] = _predicted("simulate")(self, u)
         return outputs

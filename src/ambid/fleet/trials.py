@@ -13,6 +13,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, work
 from ambid.fleet.run import Job, JobOf, job_of, numbers_of
+from ambid.job.data import RigSource
 from ambid.job.simulation import bench_of_source, simulate
 from ambid.ledger.entry import settings_text
 from ambid.physics.presets import Preset
@@ -40,7 +41,7 @@ class _Run:
 
 
 def monte_carlo(
-    rig: Rig | str | Path,
+    rig: RigSource,
     *,
     runs: int = 100,
     seed: int = 1,
@@ -58,7 +59,7 @@ def monte_carlo(
 
     Parameters
     ----------
-    rig : Rig, str or Path
+    rig : Rig, path, dict or TOML text
         A rig or its file, or the name of a preset; each of its parameters has a value.
     runs : int, optional
         Number of records.

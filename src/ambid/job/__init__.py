@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ambid.job.fits import compare as compare
     from ambid.job.fits import fit as fit
     from ambid.job.fits import physics as physics
+    from ambid.job.identification import demo as demo
     from ambid.job.identification import identify as identify
     from ambid.job.identification import identify_nonlinear as identify_nonlinear
     from ambid.job.loop_margins import margins as margins

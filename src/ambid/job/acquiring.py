@@ -20,13 +20,14 @@ from ambid.acquisition.trials import Trial, band_for, fitting_amplitude
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, DeviceError, counted
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import known_rig
+from ambid.job.data import RigSource, known_rig
 from ambid.job.results import experiment_of
 from ambid.job.simulation import FRACTION, LEAST_PERIODS, bench_of_source, waves_of_axes
 from ambid.physics.presets import Preset
 from ambid.record.sampling import MIN_SAMPLES
 from ambid.rig import Rig
 from ambid.settings.caller import LARGEST, check_band, check_positive, check_whole, refuse_given, setting
+from ambid.settings.calls import of_job
 from ambid.simulation.rotor_bench import RotorBench
 
 _TRIAL_S = 2.0  # of each trial of an amplitude
@@ -143,9 +144,10 @@ class Request:
         return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s, program=program)
 
 
+@of_job("acquire")
 def acquire(
     port: str,
-    rig: Rig | str | Path,
+    rig: RigSource,
     out: str | Path,
     *,
     seconds: float = 10.0,
@@ -157,7 +159,7 @@ def acquire(
     bench: str | Path | Rig | Preset | None = None,
     pace: Literal["fastest", "real-time"] = "fastest",
     seed: int = 0,
-    arm: Rig | str | Path | None = None,
+    arm: RigSource | None = None,
     force: bool = False,
     stopped: Callable[[], bool] = lambda: False,
     on_note: Note = _mute,
@@ -172,7 +174,7 @@ def acquire(
     port : str
         A serial port, ``"emulated"`` (the firmware on an emulated controller before a simulated bench),
         ``"simulated"`` (a simulated bench alone, or a rotor in its bearings), or ``"replay:FILE"``.
-    rig : Rig, str or Path
+    rig : Rig, path, dict or TOML text
         Calibrations, ``[loop]``, ``[daq]``.
     out : str or Path
         Record to write: .h5, .hdf5, .csv or .csv.gz. A journal beside it holds what came so far.

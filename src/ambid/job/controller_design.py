@@ -46,7 +46,7 @@ from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, part_of, silent
 from ambid.job.closed_loop import Numbers, plant_of
-from ambid.job.data import Clock, rig_entry
+from ambid.job.data import Clock, RigSource, rig_entry
 from ambid.job.loop_margins import given, noise_by_name
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Interval, Loop, Noise
@@ -54,6 +54,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import by_name, check_whole
+from ambid.settings.calls import of_job
 
 _JUDGES = 200  # plants that judge a design
 _ROUNDS = 3  # in which the limits are met on the plants that judge too
@@ -83,9 +84,10 @@ METHODS: Mapping[str, Callable[[], Callable[..., Loop]]] = {"pid": _pid, "lqg": 
 """By the name that ``method`` takes: what designs is imported when it is asked for."""
 
 
+@of_job("design controller")
 def design_controller(
     estimate: Numbers | str | Path,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     method: str = "pid",
     goals: Sequence[str] = GOALS,
@@ -110,7 +112,7 @@ def design_controller(
     ----------
     estimate : Estimate, str or Path
         The plant, as `ambid.identify` finds it.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         With the present ``[loop]``; default: that of the estimate.
     method : {"pid", "lqg", "hinf"}
         "pid": the present structure, tuned; "lqg" and "hinf": a state-space law with integral action by the

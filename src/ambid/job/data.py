@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 from ambid.errors import EstimationError
 from ambid.record import GapPolicy, Record, cut, read_record
 from ambid.record import Source as Source
-from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
+from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_from_tables, rig_text
 from ambid.rig.load import read_columns
+from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
@@ -49,9 +50,17 @@ def sources_of(records: Source | Sequence[Source]) -> list[Source]:
     return list(records) if isinstance(records, (list, tuple)) else [records]  # type: ignore[list-item]
 
 
-def known_rig(rig: Rig | str | Path | None) -> Rig:
-    """Return a rig, read from its file where it is none; by default all is free and columns are named like roles."""
-    return default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
+RigSource = Rig | str | Path | Mapping[str, Any]
+"""A rig: itself, its file, the text of one, or its tables as a dict; a text or a dict may leave the schema out."""
+
+
+def known_rig(rig: RigSource | None) -> Rig:
+    """Return a rig in whatever form it is given; by default all is free and columns are named like roles."""
+    if rig is None or isinstance(rig, Rig):
+        return rig or default_rig()
+    if isinstance(rig, str) and ("\n" in rig or ("=" in rig and not rig.lower().endswith(".toml"))):
+        return rig_from_tables(rig)
+    return rig_from_tables(rig) if isinstance(rig, Mapping) else load_rig(rig)
 
 
 def rig_entry(rig: Rig) -> dict[str, object]:
@@ -183,7 +192,7 @@ class Columns(TypedDict, total=False):
     rate_hz: float | None  # sampling rate of a source without time
     gaps: GapPolicy | None
     units: Mapping[str, str] | None  # of the columns of a table in memory
-    rig: Rig | str | Path | None  # names and calibrates the channels
+    rig: RigSource | None  # names and calibrates the channels
     layout: Mapping[str, str] | None  # of a file, as `read_record` takes it
 
 
@@ -259,8 +268,8 @@ def _role(name: str, rig: Rig, roles: tuple[str, ...], what: str) -> str:
     found = next((c.role for c in rig.channels if name in (c.role, c.column) and c.role in roles), None)
     if found is None:
         raise EstimationError(
-            f"--{what} {name}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or omit "
-            f"--{what} for all"
+            f"{setting(what, name)}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or omit "
+            f"{setting(what)} for all"
         )
     return found
 

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambid.errors import AmbidError, RecordError, choices
-from ambid.job.data import known_rig
+from ambid.job.data import RigSource, known_rig
 from ambid.physics.linear_model import LinearModel, model
 from ambid.record import NAMED, GapPolicy, Record, Source, format_of, read_record
 from ambid.record.record import Channel
 from ambid.record.words import label_of, unit_or_none, unit_within
-from ambid.rig import Rig, read_bench
+from ambid.rig import read_bench
 from ambid.rig.draft import axes_of, draft_rig, model_of
 from ambid.rig.roles import ROLES, Candidate, close, rank_roles, unit_of
 from ambid.settings.caller import setting
+from ambid.settings.calls import of_job
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
@@ -134,9 +135,10 @@ def guess(
     return Guess(ranked=ranked, units=units, why=why, question=question, time=str(settings.get("time", "")))
 
 
+@of_job("info")
 def info(
     record: Source,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
@@ -148,7 +150,7 @@ def info(
     Parameters
     ----------
     record : file, Record, DataFrame, Dataset or dict of arrays
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         Names and calibrates the channels; what the inputs explain then does not count as noise.
     rate_hz, gaps, units : optional
         As `ambid.identify`.

@@ -39,8 +39,8 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.uncertainty import WEAK
 from ambid.job.closed_loop import plant_of
-from ambid.job.data import Clock, known_rig, rig_entry
-from ambid.job.results import load, rig_of
+from ambid.job.data import Clock, RigSource, known_rig, rig_entry
+from ambid.job.results import load_result, rig_of
 from ambid.job.simulation import BenchSource, bench_of_source, samples_of
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.presets import Preset
@@ -50,6 +50,7 @@ from ambid.rig import Rig, rig_of_preset
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import LEAST_LINES, LEAST_PERIODS
 from ambid.settings.caller import check_band, check_positive, check_share, check_switch, check_whole, saved, setting
+from ambid.settings.calls import of_job
 from ambid.signals.excitations import schroeder_phases
 from ambid.simulation.plant import LinearPlant
 from ambid.simulation.rig_bench import Bench, loop_of_rig
@@ -100,9 +101,10 @@ class Wanted:
     seed: int = 0
 
 
+@of_job("design experiment")
 def design_experiment(
     source: BenchSource,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     seconds: float | None = None,
     period: float | None = None,
@@ -129,7 +131,7 @@ def design_experiment(
     source : str, Path, Rig, Preset, Estimate or RotorEstimate
         A preset by its name; a rig or its file, designed for its values; a linear estimate, of one axis or of a rotor,
         or its file, designed for what it found, with its noise.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         Of an estimate: with other limits, loop or controller than its own.
     seconds : float, optional
         Length of the record in s; default 10.
@@ -210,18 +212,18 @@ def design_experiment(
 
 
 def _given(
-    source: BenchSource, rig: Rig | str | Path | None, rate_hz: float | None, closed: bool | None
+    source: BenchSource, rig: RigSource | None, rate_hz: float | None, closed: bool | None
 ) -> tuple[Known | None, AnyBench]:
     """Return the estimate, where that is the source, and the bench with the numbers that are designed for."""
     if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
-        source = load(source)
+        source = load_result(source)
     known = source if isinstance(source, (Estimate, RotorEstimate)) else None
     given = None if rig is None else known_rig(rig)
     if given is not None and known is None:
         raise AmbidError(f"{setting('rig')} is for an estimate; a rig is there already. Omit {setting('rig')}")
     if isinstance(source, RotorEstimate):
         return source, _rotor_of(source, given or rig_of(source, "the estimate"), rate_hz, closed)
-    if not isinstance(source, (str, Path, Rig, Preset, Estimate)):
+    if not isinstance(source, (str, Path, Rig, Mapping, Preset, Estimate)):
         raise AmbidError(
             f"a {type(source).__name__} is no linear estimate, for which an experiment is designed. Give "
             f"{saved('identify')}, or a rig"

@@ -11,24 +11,26 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from ambid.blackbox.data import Candidate, candidates_of, fixed_of, orders_of, settings_of
+from ambid.blackbox.data import candidates_of, fixed_of, orders_of, settings_of
 from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure
 from ambid.blackbox.fit import structure as structure_named
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
-from ambid.job.data import Channels, Clock, Names, Source, check_same_bench, known_rig, sources_of
+from ambid.job.data import Channels, Clock, Names, RigSource, Source, check_same_bench, known_rig, sources_of
 from ambid.nonlinear.fit import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.linear_model import model
-from ambid.record import GapPolicy
-from ambid.rig import Rig
+from ambid.record import GapPolicy, Record, read_record
+from ambid.rig import default_rig
 from ambid.settings.caller import refuse_given, setting
+from ambid.settings.calls import of_job
 
 if TYPE_CHECKING:
     from ambid.bearing.physical import PhysicalFit
     from ambid.blackbox.data import IOData, Orders
     from ambid.blackbox.fit import BlackBoxFit
     from ambid.nonlinear.fit import NonlinearFit, Settings
+    from ambid.validation.agreement import Agreement
     from ambid.validation.comparison import Comparison
 
 _ORDERS = 0.95  # of a job's time goes into the choice of orders, where they are chosen
@@ -36,19 +38,20 @@ _USUAL_ORDERS = 12  # fits, about half of those that it takes
 _SEARCH = 0.95  # of a nonlinear job's time, by experience; the rest are the checks
 
 
+@of_job("fit")
 def fit(
     records: Source | Sequence[Source],
-    *,
     structure: str,
+    *,
     input: Names | None = None,  # noqa: A002 - the words of the command
     output: Names | None = None,
     reference: Names | None = None,
-    orders: Orders | Settings | str | None = "auto",
+    orders: Orders | Settings | Sequence[int] | int | str | None = "auto",
     settings: object = None,
     seed: int | None = None,
     criterion: str = "bic",
     fix: Mapping[str, float] | Sequence[str] | str | None = None,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     open_loop: bool = False,
     at_rest: bool = False,
     from_s: float | None = None,
@@ -69,12 +72,14 @@ def fit(
     structure : str
         As in `ambid.blackbox.fit` or `ambid.nonlinear.fit`.
     input, output, reference : str or sequence of str, optional
-        Names of channels; no input for a time series. With a rig its roles or columns, by default all of its model.
+        Names of channels; no input for a time series. With a rig its roles or columns, by default all of its model;
+        so too of a record whose channels are called voltage, current and position.
         References are the loop's outer excitation, for methods that use it.
-    orders : str or Mapping[str, int, "auto" or tuple of int], optional
-        Orders of a linear structure: ``"na=2,nb=2,nk=1"`` as in the command, or by name, with a tuple where inputs
-        differ. "auto": all are chosen by `criterion`. Of a nonlinear structure its settings, as ``ambid models`` lists
-        them (``"ny=2,degree=3"``); the method chooses those left out.
+    orders : str, Mapping[str, int, "auto" or tuple of int], int or sequence of int, optional
+        Orders of a linear structure: ``"na=2,nb=2,nk=1"`` as in the command, by name, with a tuple where inputs
+        differ, or ``[2, 2, 1]`` in their order (na, nb, nc, nd, nf, nk, without those it does not have).
+        "auto": all are chosen by `criterion`. Of a nonlinear structure its settings, as ``ambid
+        models`` lists them (``"ny=2,degree=3"``); the method chooses those left out.
     settings : optional
         Former name of the orders of a nonlinear structure; refused.
     seed : int, optional
@@ -83,7 +88,7 @@ def fit(
         Criterion that chooses orders, see `ambid.validation.orders`.
     fix : Mapping[str, float] or sequence of str, optional
         Known coefficients of polynomial structures, by name (``{"a1": -1.5}`` or ``["a1=-1.5"]``).
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         Names and calibrates the channels.
     open_loop : bool, optional
         Declare the record open loop.
@@ -122,11 +127,14 @@ def fit(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
         rig=rig, layout=layout,
     )  # fmt: skip
-    sources = sources_of(records)
+    sources, structure = sources_of(records), str(structure).lower()
+    if not (channels.inputs or channels.outputs or channels.references or channels.rig):
+        sources, channels = _by_role(sources, structure, channels)
     if settings is not None:
         raise EstimationError("settings of a nonlinear structure are its orders now. Give them as orders")
     nonlinear, fixed = structure in NONLINEAR_STRUCTURES, fixed_of(fix)
-    wanted: Any = settings_of(orders) if nonlinear else orders_of(orders)
+    placed: Any = _by_place(structure, orders)
+    wanted: Any = settings_of(placed) if nonlinear else orders_of(placed)
     if nonlinear:
         linear_only = {"fix": fixed, "reference": channels.references, "at_rest": at_rest,
                        "criterion": criterion != "bic"}  # fmt: skip
@@ -155,6 +163,33 @@ def fit(
         )
         clock.lap("checks")
     return replace(found, timing_s=clock.laps, used=(data, second))  # type: ignore[no-any-return]
+
+
+def _by_role(sources: list[Source], structure: str, channels: Channels) -> tuple[list[Source], Channels]:
+    """Read records whose inputs and outputs are not named: those of a rig without knowledge, if they are there."""
+    how: Any = {"rate_hz": channels.rate_hz, "gaps": channels.gaps or "error", "layout": channels.layout}
+    read: list[Source] = [read_record(x, units=channels.units, **how) for x in sources]
+    rig, names = default_rig(), read[0].names if read and isinstance(read[0], Record) else ()
+    known = {c.role for c in rig.channels} <= {*names}
+    if names and not known and structure in {*STRUCTURES, *NONLINEAR_STRUCTURES}:
+        raise EstimationError(
+            f"no input and no output were named; the record has {', '.join(names)}. Give "
+            f"{setting('output', 'COLUMN')}, and {setting('input', 'COLUMN')} unless it is a time series"
+        )
+    timed = structure in STRUCTURES and not structure_named(structure).inputs
+    return read, replace(channels, units=None, rate_hz=None, rig=rig if known and not timed else None)
+
+
+def _by_place(structure: str, orders: Any) -> Any:
+    """Return orders by name that were given by their places."""
+    if isinstance(orders, bool) or not isinstance(orders, (int, list, tuple)) or structure not in STRUCTURES:
+        return orders
+    names, values = STRUCTURES[structure].orders, [orders] if isinstance(orders, int) else list(orders)
+    if len(names) != len(values):
+        raise EstimationError(
+            f"{setting('orders')} is {orders!r}; {structure} has {', '.join(names)}, in this order. Give each"
+        )
+    return dict(zip(names, values, strict=True))
 
 
 def _estimate_linear(
@@ -233,14 +268,14 @@ def _physical_weights(data: IOData, delay: int) -> Mapping[str, float] | None:
     return {**A, "b3": float(space.B[2, 0]), **gain}
 
 
-def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
+def physics(found: BlackBoxFit, rig: RigSource) -> PhysicalFit:
     """Carry a fit to the physical parameters of a rig.
 
     Parameters
     ----------
     found : BlackBoxFit
         With inputs and outputs named by role.
-    rig : Rig, str or Path
+    rig : Rig, path, dict or TOML text
         Its model, what it fixes and knows, its delay.
 
     Returns
@@ -265,14 +300,15 @@ def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
     return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
 
 
+@of_job("compare")
 def compare(
-    record: Source,
-    candidates: Sequence[Candidate],
+    record: Any,
+    candidates: Any = (),
     *,
     input: Names | None = None,  # noqa: A002 - the words of the command
     output: Names | None = None,
     reference: Names | None = None,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     open_loop: bool = False,
     from_s: float | None = None,
     to_s: float | None = None,
@@ -283,15 +319,17 @@ def compare(
     validate: Source | None = None,
     holdout: float = 0.3,
     tick: Tick | None = None,
-) -> Comparison:
-    """Fit several structures to one record and compare them on data that none of them has seen.
+) -> Comparison | Agreement:
+    """Fit several structures to one record and compare them on data that none of them has seen; or compare estimates.
 
     Parameters
     ----------
-    record : file, Record, DataFrame, Dataset or dict of arrays
-    candidates : sequence of str or (str, orders)
+    record : file, Record, DataFrame, Dataset or dict of arrays; estimate
+        Or the first of several estimates or fits of one kind, or of their files; or all of them, in a list or by name
+        in a dict. They are tested for whether they are of one machine; nothing else is then to be given.
+    candidates : sequence of str or (str, orders); estimate
         Structures with their orders: ``"arx:na=2,nb=2,nk=1"``, ``"n4sid"`` (orders are chosen), or a name beside
-        orders as `fit` takes them.
+        orders as `fit` takes them. Or the second estimate, or a list of further ones.
     input, output, reference, rig, open_loop, from_s, to_s, rate_hz, gaps, units, layout, tick : optional
         As `fit`.
     validate : as `record`, optional
@@ -301,15 +339,29 @@ def compare(
 
     Returns
     -------
-    Comparison
+    Comparison, or of estimates Agreement
 
     Raises
     ------
     AmbidError
         If the record, its channels or the orders break a rule.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> a, b = (ambid.identify(ambid.simulate("thesis", duration=0.5, seed=s)) for s in (1, 2))
+    >>> ambid.compare(a, b).checks["one_machine"].passed
+    True
     """
     from ambid.validation.comparison import compare as compare_fits
 
+    results = _results(record, candidates)
+    if results is not None:
+        from ambid.validation.agreement import agreement
+
+        return agreement(results)
+    candidates = [candidates] if isinstance(candidates, str) else candidates
+    candidates = [x if isinstance(x, str) else (x[0], _by_place(*x)) for x in candidates]
     wanted, channels = candidates_of(candidates), Channels.of(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
         rig=rig, layout=layout,
@@ -322,6 +374,42 @@ def compare(
         check_same_bench(data.units, data.dt, second)
     with one_thread():
         return compare_fits(data, wanted, holdout=holdout, second=second, tick=tick or silent)
+
+
+def _results(first: Any, second: Any) -> dict[str, Any] | None:
+    """Return results that are to be compared, by name; None where `first` is a record."""
+    from ambid.estimation.estimate import Parametric
+    from ambid.job.results import load_result
+
+    def is_one(x: Any) -> bool:
+        return isinstance(x, Parametric) or (isinstance(x, str | Path) and Path(x).suffix.lower() == ".json")
+
+    given = first if isinstance(first, Mapping | list | tuple) else (first,)
+    named = (
+        given.items() if isinstance(given, Mapping) else enumerate([*given, *([second] if is_one(second) else second)])
+    )
+    entries = list(named)
+    results = [is_one(x) for _, x in entries]
+    if not any(results):
+        return None
+    if not all(results):
+        raise EstimationError("a record is judged by one estimate, and estimates are compared among themselves. Use "
+                              "ambid.validate(estimate, record)")  # fmt: skip
+    files = [Path(x) for _, x in entries if isinstance(x, str | Path)]
+    alike = len({x.stem for x in files}) < len(files)
+    named_by = {n if isinstance(n, str) else _name(n, x, whole=alike): x for n, x in entries}
+    if len(named_by) < 2:
+        raise EstimationError("one estimate is given; comparing takes two or more. Give another")
+    loaded = {name: load_result(x) if isinstance(x, str | Path) else x for name, x in named_by.items()}
+    for name, x in loaded.items():
+        if not isinstance(x, Parametric):
+            raise EstimationError(f"{name} has no parameters to compare. Give estimates, or fits")
+    return loaded
+
+
+def _name(n: int, x: Any, *, whole: bool) -> str:
+    """Name a result by its file, as a whole where others are called alike, or by a letter."""
+    return chr(ord("A") + n) if not isinstance(x, str | Path) else str(x) if whole else Path(x).stem
 
 
 def _choose_orders(of: Structure, data: IOData, criterion: str, say: Tick) -> tuple[Any, dict[str, object]]:

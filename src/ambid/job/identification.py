@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
@@ -17,10 +18,22 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, plain_json, warnings_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of, sources_of
+from ambid.job.data import (
+    Clock,
+    Reading,
+    RigSource,
+    Source,
+    known_rig,
+    load_bench,
+    origin,
+    rig_entry,
+    signals_of,
+    sources_of,
+)
 from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
 from ambid.settings.caller import saved, setting
+from ambid.settings.calls import of_job
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
@@ -38,9 +51,10 @@ _OF_THE_MODEL = {
 """Checks that an extension has to pass: those that asked for it."""
 
 
+@of_job("identify")
 def identify(
     record: Source | Sequence[Source],
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     validate: Source | None = None,
     speed_rpm: float | Sequence[float] | None = None,
@@ -62,7 +76,7 @@ def identify(
     record : file, Record, DataFrame, Dataset or dict of arrays; of a rotor also a sequence of these
         In the rig's columns. A table is one of pandas or polars, with columns ``name [unit]`` (or `units`) and time as
         index, as a column ``time [s]`` or told by `rate_hz`; a Dataset one of xarray.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         What is known of the bench; default: columns voltage, current and position, everything free.
     validate : as `record`, optional
         A second record of the same bench to validate the estimate on.
@@ -127,6 +141,35 @@ def identify(
         )
     estimate = identify_axis(sources[0], bench, validate=validate, tick=tick, **reading)
     return replace(estimate, checks={**estimate.checks, **_reached(planned, estimate)})
+
+
+def demo(*, tick: Tick | None = None) -> Estimate:
+    """Identify the embedded record: 0.4 s of an unstable bearing in closed loop, simulated with noise.
+
+    Parameters
+    ----------
+    tick : callable, optional
+        As `identify`.
+
+    Returns
+    -------
+    Estimate
+        Its record is ``used``; ``ambid.preset("unstable-bearing").parameters`` are the true ones.
+
+    Raises
+    ------
+    AmbidError
+        If the embedded files were changed.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> ambid.demo().verdict.word
+    'usable'
+    """
+    data = files("ambid").joinpath("data")
+    with as_file(data / "demo.csv.gz") as record, as_file(data / "demo.toml") as rig:
+        return identify_axis(record, known_rig(rig), tick=tick)
 
 
 def _planned(experiment: Experiment | str | Path) -> Experiment:
@@ -335,9 +378,10 @@ def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
     return check
 
 
+@of_job("identify")
 def identify_nonlinear(
     records: Source | Sequence[Source],
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     held: Source | Sequence[Source] = (),
     validate: Source | None = None,
@@ -359,7 +403,7 @@ def identify_nonlinear(
     ----------
     records : file, Record, DataFrame, Dataset or dict of arrays, or sequence of these
         In which the rotor moves.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         What is known of the bench, of the magnet in ``[magnet]``.
     held : as `records`, optional
         With the rotor held at rest at different distances: they show the coil.

@@ -35,7 +35,7 @@ from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.closed_loop import Numbers, loop_of, measure, refuse_unstable, spectra_of
-from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry
+from ambid.job.data import Clock, Reading, RigSource, Source, known_rig, load_bench, origin, rig_entry
 from ambid.job.rotor import balance_planes
 from ambid.physics.linear_model import model
 from ambid.physics.loop import UNLIMITED
@@ -45,11 +45,13 @@ from ambid.rig import Rig
 from ambid.rotor.balance import Machine
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import saved, setting
+from ambid.settings.calls import of_job
 
 
+@of_job("margins")
 def margins(
     record: Source | Numbers,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     estimate: Numbers | str | Path | None = None,
     reference: str | None = None,
@@ -70,7 +72,7 @@ def margins(
     ----------
     record : file, Record, DataFrame, Dataset or dict of arrays; Estimate, RotorEstimate or its .json file
         Of the levitated rotor. Of an estimate alone nothing is measured.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         What is known of the bench; default: that of the estimate, else as `ambid.identify`.
     estimate : Estimate, RotorEstimate, str or Path, optional
         The plant; default: identified from the record first.
@@ -164,12 +166,12 @@ def _with_reference(bench: Record, rig: Rig, column: str) -> Record:
     return replace(bench, channels=(*others, replace(bench.channel(column), name="reference")))
 
 
-def given(estimate: Any, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
+def given(estimate: Any, rig: RigSource | None) -> tuple[Numbers, Rig]:
     """Return an estimate that is given, and the rig: its own unless another is given."""
-    from ambid.job.results import load, rig_of
+    from ambid.job.results import load_result, rig_of
 
     name = Path(estimate).name if isinstance(estimate, str | Path) else "the estimate"
-    known = load(estimate) if isinstance(estimate, str | Path) else estimate
+    known = load_result(estimate) if isinstance(estimate, str | Path) else estimate
     if not isinstance(known, Estimate | RotorEstimate):
         raise EstimationError(
             f"{name} is no linear estimate of a bearing or a rotor, and a loop is judged on a linear plant. Give "

@@ -9,7 +9,6 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal, Unpack
 
 import numpy as np
@@ -24,7 +23,7 @@ from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit, warnings_of
 from ambid.estimation.progress import Tick
 from ambid.estimation.uncertainty import WEAK
-from ambid.job.data import Reading, Source, known_rig, load_bench, origin, overlap
+from ambid.job.data import Reading, RigSource, Source, known_rig, load_bench, origin, overlap
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
 from ambid.record import Record
@@ -68,7 +67,7 @@ class BearingWords(Reading, total=False):
     drift: bool
 
 
-def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> Rig:
+def bearing_rig(rig: RigSource | None, **words: Unpack[BearingWords]) -> Rig:
     """Return a rig whose `magnet` is known as it says, but for what is given here."""
     bench = known_rig(rig)
     if bench.model != "one-axis":

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
 from numbers import Integral
+from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
@@ -10,15 +14,23 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, plant_form, run_states, state_space_to_control
+from ambid.blackbox.prediction import (
+    errors,
+    errors_ahead,
+    errors_elsewhere,
+    plant_form,
+    run_states,
+    state_space_to_control,
+)
 from ambid.blackbox.prediction import to_control as black_box_to_control
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, needs
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, signals_of
 from ambid.job.exchange import export, plant_of
 from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.linear_model import StateSpace, discretise, model
+from ambid.record import ENDINGS, Record
 from ambid.rotor.estimate import RotorEstimate
 
 validated, exported = validate, export
@@ -72,9 +84,42 @@ def _nonlinear(fit: NonlinearFit, data: Any, ahead: int) -> Array:
     return np.array([of.simulate(data.u[w], data.y[w])[-1] for w in windows]).reshape(n, data.n_outputs)
 
 
+def residuals(result: AnyEstimate | AnyFit) -> Any:
+    """Return the innovations on the record that a result was made from, as a DataFrame over time."""
+    data = result.used
+    if data is None or not isinstance(result, Estimate | BlackBoxFit | NonlinearFit):
+        why = "was read from a file, without its record" if data is None else "comes from several records or periods"
+        raise EstimationError(f"the result {why}, so it has no residuals of its own. Use validate(record)")
+    if isinstance(result, Estimate):
+        from ambid.validation.second_record import replay
+
+        plant = model(result.model)
+        names, units, e = plant.outputs, plant.units, replay(result, signals_of(data, plant)).innovations
+        start, n, rate = data.start_s, data.n_samples, data.rate_hz
+    else:
+        names, units, first = result.outputs, result.units, data[0][0]
+        if isinstance(result, BlackBoxFit):
+            e = errors(result, first).one_step
+        else:
+            from ambid.validation.fits import run
+
+            found = run(result, first)
+            e = found.one_step[found.lag :]
+        start, n, rate = 0.0, first.n_samples, 1.0 / result.dt
+    with needs("pandas", "a DataFrame", "frames"):
+        import pandas
+    time = pandas.Index(start + np.arange(n - len(e), n) / rate, name="time [s]")
+    return pandas.DataFrame(e, index=time, columns=[f"{name} [{units[name]}]" for name in names])
+
+
 def simulate(result: Estimate | AnyFit, u: Any, start: Any = None) -> dict[str, Array]:
     """Run a model on inputs alone, from rest at its operating point, (n_samples,) by output in SI."""
     names = model(result.model).inputs if isinstance(result, Estimate) else result.inputs
+    if isinstance(u, Mapping) and {*names} <= {*u}:
+        u = np.stack([np.asarray(u[name], dtype=np.float64) for name in names], axis=-1)
+    is_file = isinstance(u, str | Path) and str(u).lower().endswith(ENDINGS)
+    if is_file or isinstance(u, Record) or hasattr(u, "columns") or hasattr(u, "data_vars"):
+        u = _inputs_of(result, data_of(result, u, where="the result"))
     try:
         given = np.asarray(u)
     except ValueError:  # rows of several lengths
@@ -87,6 +132,8 @@ def simulate(result: Estimate | AnyFit, u: Any, start: Any = None) -> dict[str, 
             f"{len(names)}), {', '.join(names)} in SI units, are needed. Correct u"
         )
     inputs = inputs.astype(np.float64)
+    if _runs_away(result, len(inputs)):
+        return _in_its_loop(result, inputs[:, 0])
     if isinstance(result, Estimate):
         plant, at = model(result.model), result.operating_point
         y = _delayed(result, inputs - [at[role] for role in plant.inputs]) + [at[role] for role in plant.outputs]
@@ -101,6 +148,51 @@ def simulate(result: Estimate | AnyFit, u: Any, start: Any = None) -> dict[str, 
         first[:] = 0.0 if start is None else np.asarray(start, dtype=np.float64).reshape(first.shape)
         y = result.model.simulate(inputs, first)
     return dict(zip(result.outputs, y.T, strict=True))
+
+
+def _inputs_of(result: Estimate | AnyFit, data: Any) -> Any:
+    """Return the inputs of a record; of a plant that runs away what was added to its controller's output."""
+    if not isinstance(result, Estimate):
+        return data.u
+    if not _runs_away(result, data.n_samples):
+        return signals_of(data, model(result.model)).u
+    if "reference" not in data or data["reference"].unit != "V":
+        raise EstimationError(
+            "the plant is unstable in open loop, and the record has no reference in V that its loop could run on. Give "
+            "what is added to the controller's output as an array, or use predict(record)"
+        )
+    return data["reference"].values
+
+
+def _runs_away(result: Estimate | AnyFit, n: int) -> bool:
+    """Whether an unstable plant grows by more than e within some samples."""
+    if isinstance(result, Estimate):
+        return bool(result.poles.real.max() * n > float(str(result.record["rate_hz"])))
+    if isinstance(result, NonlinearFit) or not result.inputs:
+        return False
+    largest = np.abs(np.linalg.eigvals(plant_form(result).A)).max(initial=0.0)
+    return bool(n * np.log(max(largest, 1e-300)) > 1.0)
+
+
+def _in_its_loop(result: Estimate | AnyFit, wave: Array) -> dict[str, Array]:
+    """Run an unstable plant in its rig's loop, without noise and limits; `wave` is added to the controller's output."""
+    from ambid.job.simulation import rig_of_estimate
+    from ambid.simulation.rig_bench import Bench
+
+    rig = rig_of_estimate(result) if isinstance(result, Estimate) else None
+    if rig is None or rig.loop is None or not rig.loop.closed:
+        raise EstimationError(
+            "the plant is unstable in open loop: on inputs alone its outputs run away, and no [loop] of a rig is "
+            "known. Identify with a rig that has one, or use predict(record)"
+        )
+    bench = Bench.of(replace(rig, noise=None, limits=None), None, True)
+    bench.refuse_unstable()
+    warnings.warn(
+        "the plant is unstable in open loop: it runs in its rig's [loop], and u is added to the controller's output",
+        stacklevel=4,
+    )
+    done = bench.simulate(wave, seed=0, columns=False).record
+    return {role: done[role].values for role in model(str(result.model)).outputs}
 
 
 def _delayed(estimate: Estimate, u: Array) -> Array:

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import AmbidError, EstimationError
+from ambid.errors import AmbidError, EstimationError, needs
 from ambid.estimation.estimate import fields_json, json_text, plain_json
 from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
@@ -72,11 +72,12 @@ def content(result: Result) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def figure(result: Result, record: Any = None) -> Figure:
-    """Draw a result beside a record, or what it was made from, with the verdict above."""
-    from ambid.report.drawing import judged
+def figure(result: Result, record: Any = None, ax: Any = None) -> Figure:
+    """Draw a result beside a record, or what it was made from, with the verdict above; into axes without it."""
+    from ambid.report.drawing import into, judged
 
-    return judged(drawing(result, record), result.verdict)
+    page = into(ax, lambda: drawing(result, record))
+    return page if ax is not None else judged(page, result.verdict)
 
 
 def drawing(result: Result, record: Any = None) -> Figure:
@@ -132,10 +133,8 @@ def document(result: Result) -> str:
 
 def dataframe(result: Result) -> Any:
     """Return the table of a result as a pandas.DataFrame."""
-    try:
+    with needs("pandas", "a DataFrame", "frames"):
         import pandas
-    except ImportError:
-        raise AmbidError("pandas is not installed, and a DataFrame needs it. Install pandas") from None
     index, columns = document_of(result).frame()
     return pandas.DataFrame(dict(columns)).set_index(index)
 
@@ -378,6 +377,7 @@ _KINDS: Mapping[str, Kind] = {
         describe=_declared("response.response_document"), write=_written("bearing.measured.measured_text")
     ),
     "Comparison": Kind(describe=_declared("fit.comparison_document"), write=_compared),
+    "Agreement": _whole("agreement.agreement_document", "agreement"),
     "Commissioned": Kind(describe=_commissioned, write=_dumps),
     "Track": Kind(describe=_track, write=_written("tracking.lines_file.track_document"), beside=_followed),
     "Validation": Kind(describe=_validation, write=partial(_fields, "ambid.validation/1")),

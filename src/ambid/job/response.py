@@ -25,12 +25,13 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import Modal, plant_modes
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Channels, Clock, Names, Source
-from ambid.job.results import load, rig_of
+from ambid.job.data import Channels, Clock, Names, RigSource, Source
+from ambid.job.results import load_result, rig_of
 from ambid.physics.linear_model import model
 from ambid.record import Channel, GapPolicy, Record
 from ambid.rig import Rig, bench_record
 from ambid.settings.caller import check_band, setting
+from ambid.settings.calls import of_job
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold
 from ambid.signals.response_files import is_response_file, read_response
@@ -39,13 +40,14 @@ from ambid.units import UNKNOWN, parse_unit
 Delay = float | Literal["auto"]
 
 
+@of_job("frf")
 def frf(
     record: Source,
-    *,
     input: Names | None = None,  # noqa: A002 - the words of the command
     output: Names | None = None,
+    *,
     reference: Names | None = None,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     open_loop: bool = False,
     method: Method = "auto",
     hold: Hold | None = None,
@@ -74,7 +76,7 @@ def frf(
     input, output, reference : str or sequence of str, optional
         Names of channels. With references (the loop's outer excitation) the joint method is used, which feedback does
         not bias.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         Names and calibrates the channels; physical parameters of its model are estimated.
     open_loop : bool, optional
         Declare the record open loop.
@@ -309,7 +311,7 @@ def _check(
 
 def _plant_of(estimate: Any) -> Any:
     """Return an estimate that has a plant."""
-    found = load(estimate) if isinstance(estimate, str | Path) else estimate
+    found = load_result(estimate) if isinstance(estimate, str | Path) else estimate
     if not (hasattr(found, "continuous") and hasattr(found, "fit")):
         raise EstimationError("the estimate has no plant whose modes could be compared. Give one of 'ambid identify'")
     return found

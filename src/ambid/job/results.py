@@ -13,14 +13,15 @@ from ambid.blackbox.fit import BlackBoxFit, fit_from_json
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
-from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
+from ambid.job.data import Channels, Reading, RigSource, Source, check_same_bench, known_rig, load_bench, signals_of
 from ambid.nonlinear.fit import NONLINEAR_STRUCTURES, NonlinearFit, nonlinear_fit_from_json
 from ambid.physics.linear_model import model
-from ambid.record import GapPolicy
+from ambid.record import ENDINGS, GapPolicy, read_record
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import path_of, saved, setting
+from ambid.settings.calls import of_job
 from ambid.tracking.lines_file import SCHEMA as TRACK
 from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
@@ -39,24 +40,33 @@ _EXPERIMENT = "ambid.experiment/1"
 
 
 def load(path: str | Path) -> Any:
-    """Read a result of any verb from its file.
+    """Read a file that ambid wrote or reads: a result of any verb, a record, a rig.
 
     Parameters
     ----------
     path : str or Path
         What `Result.save` or the command's option ``json`` wrote: an estimate, fit, track, frequency response,
-        comparison, validation, inspection or acquisition.
+        comparison, validation, inspection or acquisition. Or a record, as `ambid.read_record` reads it, or a rig.
 
     Returns
     -------
-    Result
-        Without the record it was made from: give that as ``record=`` to figures that show it.
+    Result, Record or Rig
+        By the ending of the file. A result is without the record it was made from: give that as ``record=`` to figures
+        that show it.
 
     Raises
     ------
-    EstimationError
-        If the file cannot be read, or is not a complete result.
+    AmbidError
+        If the file cannot be read, or is not complete.
     """
+    path = path_of(path, "result")
+    if path.name.lower().endswith(ENDINGS):
+        return read_record(path)
+    return known_rig(path) if path.suffix.lower() == ".toml" else load_result(path)
+
+
+def load_result(path: str | Path) -> Any:
+    """Read a result of any verb from its file."""
     path = path_of(path, "result")
     text = _text(path, "estimate")
     if f'"{TRACK}"' in text[:_BEGIN]:
@@ -143,6 +153,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.history/1": _whole("ledger.history", "History", "history"),
     "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet_simulate"),
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
+    "ambid.agreement/1": _whole("validation.agreement", "Agreement", "compare"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_record", "Validation", "validate"),
@@ -174,7 +185,7 @@ def experiment_of(excitation: object) -> Experiment | None:
 
 def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:
     """Read an estimate from which linear tracking can begin; `otherwise` is the refusal of any other result."""
-    found = load(path)
+    found = load_result(path)
     if not isinstance(found, Estimate):
         raise EstimationError(otherwise)
     return found
@@ -206,10 +217,11 @@ def data_of(
     return take_record(record, bearing_rig(bench), reading)
 
 
+@of_job("validate")
 def validate(
     estimate: AnyEstimate | AnyFit | str | Path,
     record: Source,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     from_s: float | None = None,
     to_s: float | None = None,
@@ -226,7 +238,7 @@ def validate(
         A result, or its file.
     record : file, Record, DataFrame, Dataset or dict of arrays
         Of a rotor that moves; for a rotor on many axes with periodic excitation.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         Through which the record is read; default: the rig that the estimate was made with.
     from_s, to_s, rate_hz, gaps, units, layout : optional
         As `ambid.identify`.
@@ -240,7 +252,7 @@ def validate(
     AmbidError
         If estimate, record or rig break a rule.
     """
-    known = load(estimate) if isinstance(estimate, str | Path) else estimate
+    known = load_result(estimate) if isinstance(estimate, str | Path) else estimate
     name = Path(estimate).name if isinstance(estimate, str | Path) else ""
     reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
     data = data_of(known, record, None if rig is None else known_rig(rig), where=name or "the estimate", **reading)

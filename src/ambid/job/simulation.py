@@ -14,12 +14,13 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.estimation.estimate import Estimate
-from ambid.job.results import experiment_of, load, rig_of
+from ambid.job.data import RigSource, known_rig
+from ambid.job.results import experiment_of, load_result, rig_of
 from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset_of
 from ambid.record import Channel, Record
-from ambid.rig import Rig, RigMagnet, load_rig, rig_of_preset
+from ambid.rig import Rig, RigMagnet, rig_of_preset
 from ambid.rig.draft import as_logged
 from ambid.settings.caller import (
     check_band,
@@ -29,15 +30,16 @@ from ambid.settings.caller import (
     check_whole,
     refuse_given,
     setting,
-)
+)  # fmt: skip
+from ambid.settings.calls import of_job
 from ambid.signals import excitation as make_excitation
 from ambid.signals import excitation_of_axes
 from ambid.simulation.bench import Simulation
 from ambid.simulation.rig_bench import Bench, plant_of_law
 from ambid.simulation.rotor_bench import RotorBench
 
-BenchSource = str | Path | Rig | Preset | Estimate | NonlinearBearingEstimate
-"""Who has the numbers of a bench: a preset by name, a rig, an estimate of one axis, or a file of one of these."""
+BenchSource = RigSource | Preset | Estimate | NonlinearBearingEstimate
+"""Who has the numbers of a bench: a preset by name, a rig in any form, an estimate of one axis, or a file of one."""
 
 LEAST_PERIODS = 4
 """Periods of a rotor's record: their scatter is its noise."""
@@ -55,10 +57,11 @@ class Excited:
     unit: str = "V"
 
 
+@of_job("simulate")
 def simulate(
     source: BenchSource,
-    *,
     duration: float | None = None,
+    *,
     rate_hz: float | None = None,
     excitation: str | Path | Experiment | None = None,
     amplitude: float | None = None,
@@ -77,8 +80,9 @@ def simulate(
 
     Parameters
     ----------
-    source : str, Path, Rig, Preset, Estimate or NonlinearBearingEstimate
-        A preset by its name; a rig or its file; an estimate of one axis or its file: its rig with the estimated values.
+    source : str, Path, Rig, dict, Preset, Estimate or NonlinearBearingEstimate
+        A preset by its name; a rig, its file, its text or its tables; an estimate of one axis
+        or its file: its rig with the estimated values.
     duration : float, optional
         Length in s; default 1, or the experiment's.
     rate_hz : float, optional
@@ -272,12 +276,12 @@ def bench_of_source(source: BenchSource) -> Rig | Preset:
     if named is not None:
         return named
     if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
-        path, source = source, load(source)
+        path, source = source, load_result(source)
         if not isinstance(source, Estimate | NonlinearBearingEstimate):
             raise EstimationError(f"{path} is no estimate of one axis; a simulation needs one. Give a rig")
     if isinstance(source, Estimate | NonlinearBearingEstimate):
-        return _rig_of_estimate(source)
-    return source if isinstance(source, (Rig, Preset)) else load_rig(source)
+        return rig_of_estimate(source)
+    return source if isinstance(source, Preset) else known_rig(source)
 
 
 def _bench(
@@ -301,7 +305,7 @@ def _bench(
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
 
-def _rig_of_estimate(estimate: Estimate | NonlinearBearingEstimate) -> Rig:
+def rig_of_estimate(estimate: Estimate | NonlinearBearingEstimate) -> Rig:
     """Return the rig that an estimate remembers, with the numbers that it found."""
     rig = rig_of(estimate, "the estimate")
     values, point, late = estimate.values, dict(estimate.operating_point), next(iter(estimate.delay.values()))

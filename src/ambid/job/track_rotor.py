@@ -345,9 +345,9 @@ def _periods(bench: Record, excitation: Excitation, first: int, count: int) -> R
 
 def given_start(start: object) -> RotorEstimate:
     """Return an estimate of a rotor, read from its file where it is none."""
-    from ambid.job.results import load
+    from ambid.job.results import load_result
 
-    found = load(start) if isinstance(start, (str, Path)) else start
+    found = load_result(start) if isinstance(start, (str, Path)) else start
     if not isinstance(found, RotorEstimate):
         raise EstimationError(
             f"the start is no estimate of a rotor. Give {saved('identify')} for a rig with [bearings.X]"

@@ -17,7 +17,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Names, Reading, Source, known_rig
+from ambid.job.data import Names, Reading, RigSource, Source, known_rig
 from ambid.job.following import (
     EstimatorWords,
     Flag,
@@ -32,9 +32,9 @@ from ambid.job.following import (
 from ambid.job.track_start import BenchRows, Start, check_settling, credible_limits, rows_of, start_of
 from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
-from ambid.rig import Rig, load_rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import refuse_given
+from ambid.settings.calls import of_job
 from ambid.tracking.blocks import Block, Frame, Stretch
 from ambid.tracking.engine import run
 from ambid.tracking.evidence import Samples
@@ -47,9 +47,10 @@ from ambid.tracking.rpem import PhysicalRpem
 from ambid.tracking.supervisor import Supervisor, warm_up
 
 
+@of_job("track")
 def track(
     record: Source,
-    rig: Rig | str | Path | None = None,
+    rig: RigSource | None = None,
     *,
     method: str = "rpem",
     input: Names | None = None,  # noqa: A002 - the words of the command
@@ -83,7 +84,7 @@ def track(
     ----------
     record : file, Record, DataFrame, Dataset or dict of arrays
         Rows may be missing or damaged.
-    rig : Rig, str or Path, optional
+    rig : Rig, path, dict or TOML text, optional
         What is known of the bench; default: columns voltage, current and position, everything free.
     method : str, optional
         ``rpem``, the supervised tracker, or one of `ambid.job.track_estimator.METHODS`.
@@ -140,9 +141,7 @@ def track(
     say, how, settings = tick or silent, Following(**following), EstimatorWords(
         input=input, output=output, reference=reference, orders=orders, open_loop=open_loop, step=step,
     )  # fmt: skip
-    if not (rig is None or isinstance(rig, (Rig, str, Path))):
-        raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
-    bench = load_rig(rig) if isinstance(rig, (str, Path)) else rig
+    bench = None if rig is None else known_rig(rig)
     part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units, layout=layout)
     if bench is not None and bench.rotor is not None:
         from ambid.job.track_rotor import track_rotor

@@ -26,6 +26,8 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from ambid.arrays import Array
 from ambid.errors import AmbidError, RecordError, choices
 from ambid.settings.caller import LARGEST, setting
+from ambid.settings.elsewhere import RECORD, missing
+from ambid.units import parse_unit
 
 if TYPE_CHECKING:
     import pandas
@@ -108,14 +110,35 @@ class Channel(NDArrayOperatorsMixin):
         return getattr(function, method)(*plain, **options)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
+        if name.startswith("_") or name == "values":  # which an object that is being copied lacks
             raise AttributeError(name)
         return getattr(self.values, name)
+
+    def to(self, unit: str) -> Array:
+        """Return the values in another unit of the same kind.
+
+        Parameters
+        ----------
+        unit : str
+            Such as ``"um"``.
+
+        Returns
+        -------
+        ndarray, shape (n_samples,)
+        """
+        return parse_unit(unit).of_si(self.values, self.unit)  # type: ignore[no-any-return]
 
     def __len__(self) -> int:
         return int(self.values.size)
 
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.values)
+
     def __getitem__(self, at: Any) -> Any:
+        if isinstance(at, slice) and any(isinstance(x, float) for x in (at.start, at.stop)):
+            raise RecordError(
+                f"channel {self.name!r} is cut by samples. Cut the record in seconds: record{_shown(at)}[{self.name!r}]"
+            )
         return self.values[at]
 
     def __repr__(self) -> str:
@@ -195,13 +218,70 @@ class Record:
                 return c
         raise RecordError(f"the record has no channel {name!r}; it has {choices(name, self.names)} Check the name")
 
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit by channel."""
+        return {c.name: c.unit for c in self.channels}
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Samples and channels."""
+        return self.n_samples, len(self.channels)
+
+    def keys(self) -> tuple[str, ...]:
+        """Return the names of the channels, so that ``dict(record)`` holds them.
+
+        Returns
+        -------
+        tuple of str
+        """
+        return self.names
+
+    def items(self) -> Iterator[tuple[str, Channel]]:
+        """Return names and channels.
+
+        Returns
+        -------
+        iterator of (str, Channel)
+        """
+        return zip(self.names, self.channels, strict=True)
+
+    def to_numpy(self) -> Array:
+        """Return all channels as columns, SI.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_channels)
+        """
+        return np.stack([c.values for c in self.channels], axis=1)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return self.to_numpy().astype(dtype or np.float64, copy=False)
+
+    if not TYPE_CHECKING:  # an editor and a type checker know the attributes alone
+
+        def __getattr__(self, name: str) -> Channel:
+            if name.startswith("_") or name == "channels":  # which an object that is being copied lacks
+                raise AttributeError(name)
+            if name in self.names:
+                return self.channel(name)
+            raise missing("a record", name, dir(self), RECORD)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*object.__dir__(self), *(n for n in self.names if n.isidentifier())})
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.names)
+
     @overload
     def __getitem__(self, key: str) -> Channel: ...
     @overload
-    def __getitem__(self, key: slice) -> Record: ...
-    def __getitem__(self, key: str | slice) -> Channel | Record:
+    def __getitem__(self, key: slice | list[str]) -> Record: ...
+    def __getitem__(self, key: str | slice | list[str]) -> Channel | Record:
         if isinstance(key, str):
             return self.channel(key)
+        if isinstance(key, list) and key and all(isinstance(x, str) for x in key):
+            return self.with_step(Step(name="channels"), channels=tuple(self.channel(x) for x in key))
         if isinstance(key, slice) and key.step is None:
             ends = [key.start, key.stop]
             if all(x is None or (isinstance(x, Real) and not isinstance(x, bool)) for x in ends):
@@ -280,16 +360,32 @@ class Record:
         """
         return _tables("to_xarray")(self)
 
-    def plot(self) -> Figure:
+    def save(self, path: str | Path) -> None:
+        """Write the record, as `ambid.write_record` does; `ambid.load` reads it back.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ends in ``.csv``, ``.csv.gz`` or ``.h5``.
+        """
+        import_module("ambid.record").write_record(self, path)
+
+    def plot(self, *, ax: Any = None) -> Figure:
         """Draw every channel: over time with its faults, close, and over frequency.
+
+        Parameters
+        ----------
+        ax : matplotlib axes or several, optional
+            To draw into: as many channels over time as there are axes; nothing else of their figure is touched.
 
         Returns
         -------
         matplotlib.figure.Figure
+            Nothing opens a window: a notebook displays the last line of a cell.
         """
         title = f"{self.provenance.get('file', 'record')}: {self.duration_s:.4g} s at {self.rate_hz:.6g} Hz"
         draw = import_module("ambid.report.record").record_figure
-        return draw(self, title)  # type: ignore[no-any-return]
+        return draw(self, title, ax=ax)  # type: ignore[no-any-return]
 
     def _repr_html_(self) -> str:
         """Return the table that a notebook shows."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -30,6 +31,7 @@ GREEN, ORANGE, PURPLE, SKY = "#009e73", "#e69f00", "#cc79a7", "#56b4e9"
 CYCLE = (PREDICTED, ORANGE, GREEN, PURPLE, SKY, BOUND, MEASURED)
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE = 11.0  # inches of a page
+_given: list[Any] = []  # axes that are drawn into
 _DPI = 130  # of a PNG
 PIXELS = 500  # stretches of which a long curve shows the extremes, about one for each column of pixels
 _LETTERS = 13.7  # of a legend on an inch
@@ -77,6 +79,11 @@ class Block:
     legend: Sequence[Any] = ()  # entries beside those that the panels' artists make
 
     @property
+    def panels(self) -> list[Panel]:
+        """All of them, column by column."""
+        return [p for column in self.columns for p in column]
+
+    @property
     def height(self) -> float:
         """What the block needs, inches."""
         return 0.55 + max(sum(p.height for p in column) for column in self.columns)
@@ -113,17 +120,46 @@ class Block:
 def stacked(title: str, blocks: Sequence[Block], width: float = WIDE) -> Figure:
     """Return a page of blocks, one below the other; `width` in inches."""
     import matplotlib
-    from matplotlib.figure import Figure
 
+    if _given:  # axes to draw into
+        for axes, one in zip(_given, [p for block in blocks for p in block.panels], strict=False):
+            one.draw(axes)
+        return _given[0].get_figure(root=True)  # type: ignore[no-any-return]
     heights = [block.height for block in blocks]
     with matplotlib.rc_context(_STYLE):
-        page = Figure(figsize=(width, sum(heights) + 0.5 * bool(title)), layout="constrained")
+        page: Figure = _page_class()(figsize=(width, sum(heights) + 0.5 * bool(title)), layout="constrained")
         if title:
             page.suptitle(textwrap.fill(title, int(8 * width)), fontsize=12)
         places: Any = page.subfigures(len(blocks), 1, height_ratios=heights) if len(blocks) > 1 else page
         for place, block in zip(np.atleast_1d(places), blocks, strict=True):
             block.draw(place, width)
     return page
+
+
+def into(ax: Any, draw: Callable[[], Figure]) -> Figure:
+    """Draw into axes that are given, or where there are none (None) on a page of its own."""
+    global _given
+    before, _given = _given, [] if ax is None else list(np.ravel(ax))
+    try:
+        return draw()
+    finally:
+        _given = before
+
+
+@cache
+def _page_class() -> type[Figure]:
+    """Return a figure that a notebook shows also where no backend of pyplot was chosen."""
+    from io import BytesIO
+
+    from matplotlib.figure import Figure
+
+    class Page(Figure):
+        def _repr_png_(self) -> bytes:
+            self.savefig(picture := BytesIO(), format="png", dpi=_DPI)
+            return picture.getvalue()
+
+    Page.__name__ = "Figure"
+    return Page
 
 
 def judged(figure: Figure, verdict: Verdict) -> Figure:

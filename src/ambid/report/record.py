@@ -22,6 +22,7 @@ from ambid.report.drawing import (
     Block,
     curve,
     head,
+    into,
     log_axis,
     panel,
     said_panel,
@@ -48,10 +49,12 @@ _CLOSE = 200  # samples of a close view
 _ROW = 1.6  # inches
 
 
-def record_figure(record: Record | None, title: str, looks: Sequence[Any] = (), width: float = WIDE) -> Figure:
+def record_figure(
+    record: Record | None, title: str, looks: Sequence[Any] = (), width: float = WIDE, ax: Any = None
+) -> Figure:
     """Draw every channel of a record; without a record the range, mean and spread of each, from `looks`.
 
-    `looks`: with ``name``, ``unit``, ``least``, ``most``, ``mean`` and ``sd`` of each channel.
+    `looks`: with ``name``, ``unit``, ``least``, ``most``, ``mean`` and ``sd`` of each channel; `ax`: axes to draw into.
     """
     channels: Sequence[Any] = looks if record is None else record.channels
     names = [c.name for c in channels[:_MOST]]
@@ -64,7 +67,7 @@ def record_figure(record: Record | None, title: str, looks: Sequence[Any] = (), 
         views: Sequence[Callable[..., object]] = (_whole, _close, _spectrum)
         columns = [[panel(view, record, name, height=_ROW) for name in names] for view in views]
         block = Block(columns=columns, widths=(4, 3, 3))
-    return stacked(f"{title}{hidden}", [block], width)
+    return into(ax, lambda: stacked(f"{title}{hidden}", [block], width))
 
 
 def inspection_document(inspection: Inspection, source: Record | None) -> Document:

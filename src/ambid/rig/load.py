@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.errors import ModelError, RecordError, RigError, UnitError, choices
 from ambid.physics.law import StateLaw
@@ -102,6 +102,39 @@ def rig_from_text(text: str, path: str | Path) -> Rig:
 
     path = Path(path)
     return _build(parse_rig(text, path), path)
+
+
+def rig_from_tables(tables: str | Mapping[str, Any]) -> Rig:
+    """Build a rig from what is written in a program.
+
+    Parameters
+    ----------
+    tables : Mapping or str
+        What a rig file holds, as nested dicts or as TOML; paths are relative to the present folder. The schema may be
+        left out, and the model of one axis, or of a rotor with bearings.
+
+    Returns
+    -------
+    Rig
+        As `load_rig`.
+
+    Raises
+    ------
+    RigError
+        As `load_rig`.
+
+    Examples
+    --------
+    >>> from ambid.rig import rig_from_tables
+    >>> rig_from_tables({"parameters": {"m": {"value": 100, "unit": "g", "role": "fixed"}}}).parameter("m").value
+    0.1
+    """
+    from ambid.rig.schema import SCHEMA, checked, tables_of
+
+    where = "in a text" if isinstance(tables, str) else "in a dict"
+    content = tables_of(tables, where) if isinstance(tables, str) else tables
+    usual = {"schema": SCHEMA, "model": "rotor" if "bearings" in content else "one-axis"}
+    return _build(checked({**usual, **content}, where), Path(where))
 
 
 def default_rig(model_name: str = "one-axis") -> Rig:

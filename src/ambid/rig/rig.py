@@ -310,6 +310,11 @@ class Rig:
             )
         return rate
 
+    def __repr__(self) -> str:
+        fixed = ", ".join(f"{p.name} = {p.value:.4g} {p.unit}" for p in self.parameters if p.role == "fixed")
+        columns = ", ".join(f"{c.role} from {c.column!r}" for c in self.channels)
+        return f"<Rig {self.name!r}, model {self.model}: {columns}; fixed: {fixed or 'nothing'}>"
+
     def channel(self, role: str) -> RigChannel:
         """Return the channel of a role.
 

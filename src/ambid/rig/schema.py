@@ -326,11 +326,15 @@ def parse_rig(text: str, path: Path) -> RigFile:
         raise RigError(
             f"rig {path} is empty. Write at least schema and model, or make one with: ambid init RECORD -o RIG"
         )
+    return checked(tables_of(text, str(path)), str(path))
+
+
+def tables_of(text: str, where: str) -> dict[str, Any]:
+    """Return the tables of a rig's text, whatever they hold; `where` it stands, for messages."""
     try:
-        content = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as failure:
-        raise RigError(f"rig {path} is not valid TOML: {failure}. Correct that line") from None
-    return checked(content, str(path))
+        raise RigError(f"rig {where} is not valid TOML: {failure}. Correct that line") from None
 
 
 def checked(content: dict[str, Any], where: str) -> RigFile:
