@@ -56,6 +56,7 @@ def write_reference(folder: Path) -> None:
     """Write `commands.md`, `python.md` and a page for each room into the folder; equal files are left alone."""
     folder.mkdir(parents=True, exist_ok=True)
     _write(folder / "commands.md", "\n".join(_commands()))
+    _write(folder / "options.md", "\n".join(_options()))
     lines = [
         "# Python interface",
         "",
@@ -102,6 +103,30 @@ def _commands() -> Iterator[str]:
     yield from ("# Commands", "", "What `ambid COMMAND --help` says, made from the program itself.", "")
     for name, command in verbs():
         yield from _command(name, command)
+
+
+def _options() -> Iterator[str]:
+    """Yield every option once, as it is declared: its words in a shell and in Python, and the verbs that have it."""
+    from ambid.settings.jobs import JOBS
+    from ambid.settings.table import SETTINGS
+
+    yield from (
+        "# Options",
+        "",
+        "Every option once, with its name in Python and the commands that take it; what one of",
+    )
+    yield from (
+        "them says otherwise stands in [Commands](commands.md).",
+        "",
+        "| option | in Python | what | commands |",
+    )
+    yield "|---|---|---|---|"
+    for s in sorted(SETTINGS, key=lambda x: x.flag.lstrip("-")):
+        jobs = [job for job in JOBS.values() if any(x.name == s.name for x in job.settings)]
+        words = sorted({x.metavar if x.argument else x.flag for job in jobs for x in job.settings if x.name == s.name})
+        links = ", ".join(f"[{job.name}](commands.md#ambid-{job.name.replace(' ', '-')})" for job in jobs)
+        flags = ", ".join(f"`{w}`".replace("|", "\\|") for w in words)
+        yield f"| {flags} | `{s.name}` | {_text(s.about)} | {links} |"
 
 
 def _command(name: str, command: Any) -> Iterator[str]:

@@ -10,40 +10,51 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from ambid import compiled
 from ambid.cli.terminal import plain_where_needed
 from ambid.errors import AmbidError
 
-VERBS = {
-    "demo": "identify the embedded record, and compare with the true parameters",
-    "identify": "identify physical parameters, with uncertainty, from a record",
-    "fit": "fit a black-box model to a record",
-    "frf": "measure a frequency response, and fit models to it",
-    "compare": "compare several black-box structures",
-    "acquire": "take a record from a controller, real or emulated",
-    "commission": "go from a controller to tracked parameters, step by step",
-    "console": "watch, commission and judge a bearing in the browser",
-    "track": "track parameters through a record, as on-line",
-    "margins": "show the margins of the loop of a record",
-    "history": "show a bearing over time, from a ledger",
-    "design": "design the next experiment or the controller on a model",
-    "export": "write an identified plant for other programs",
-    "fleet": "do a job on many records, real or simulated",
-    "recover": "recover a recording that was cut off",
-    "init": "draft a rig file from a record",
-    "simulate": "simulate a record from the physics",
-    "validate": "check an estimate or a fit on another record",
-    "info": "show what a record contains",
-    "models": "list models, parameters, units, excitations, presets",
+DOORS = {
+    "An Arduino and a magnet": {
+        "demo": "identify the embedded record, and compare with the true parameters",
+        "commission": "go from a controller to tracked parameters, step by step",
+        "acquire": "take a record from a controller, real or emulated",
+        "recover": "recover a recording that was cut off",
+        "console": "watch, commission and judge a bearing in the browser",
+    },
+    "A machine on magnetic bearings": {
+        "info": "show what a record contains",
+        "init": "draft a rig file from a record",
+        "identify": "identify physical parameters, with uncertainty, from a record",
+        "validate": "check an estimate or a fit on another record",
+        "margins": "show the margins of the loop of a record",
+        "track": "track parameters through a record, as on-line",
+        "design": "design the next experiment or the controller on a model",
+        "history": "show a bearing over time, from a ledger",
+        "fleet": "do a job on many records, real or simulated",
+    },
+    "Research in identification": {
+        "simulate": "simulate a record from the physics",
+        "fit": "fit a black-box model to a record",
+        "compare": "compare several black-box structures, or estimates",
+        "frf": "measure a frequency response, and fit models to it",
+        "export": "write an identified plant for other programs",
+        "models": "list models, parameters, units, excitations, presets",
+    },
 }
-"""What each verb does, in the order of the help."""
+"""What each verb does, in the order of the help, by who begins with it."""
+VERBS = {name: said for door in DOORS.values() for name, said in door.items()}
 _BESIDE = {"compare": "fit", "margins": "frf", "models": "info", "validate": "identify"}  # verbs in the file of another
 _PART = "'ambid validate RESULT RECORD' with --from and --to"
 # Words of the releases before, by job: what each is now; nothing where it is gone.
 _FORMER: Mapping[str, Mapping[str, str]] = {
     "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
-    "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
+    "identify": {
+        "magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig",
+        "export": "'ambid export ESTIMATE.json -o FILE', of what --json ESTIMATE.json wrote",
+    },
     "console": {"key": "--certificate CERT,KEY"}, "export": {"to": "--library"},
     "history": {"export": "--tables", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
     "design controller": {"method": "--kind", "export": "--law", "judges": ""}, "design experiment": {"lines": ""},
@@ -70,6 +81,18 @@ def _global(
         typer.echo(context.get_help())
 
 
+class _Doors(typer.core.TyperGroup):
+    """All verbs, shown by door."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        del ctx
+        limit = formatter.width - 6 - max(map(len, VERBS))
+        for door, verbs in DOORS.items():
+            with formatter.section(door):
+                known = [(name, self.commands[name]) for name in verbs if name in self.commands]
+                formatter.write_dl([(name, command.get_short_help_str(limit)) for name, command in known])
+
+
 def _say_compiling() -> None:
     print("compiling the numerical kernels, once on this machine, some 5 s; later starts are faster", file=sys.stderr)
 
@@ -78,6 +101,7 @@ def _say_compiling() -> None:
 def parser(verb: str = "") -> Any:
     """Return the parser of one verb's words, or of all: reading all their settings takes 60 ms, so made once."""
     app = typer.Typer(
+        cls=_Doors,
         rich_markup_mode=None,  # plain help: it pipes well, and starts without importing rich
         no_args_is_help=False,
         help="Physical parameters of active magnetic bearings, with honest uncertainty, from measured voltage, current "

@@ -80,15 +80,16 @@ def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
 def compare(v: Values) -> None:
     """Fit several structures to a record and compare them on data that none of them has seen.
 
-    Without --validate, the last part of the record is held back. Best first.
+    Without --validate, the last part of the record is held back. Best first. With what 'ambid identify --json' or
+    'ambid fit --json' wrote in the place of record and structures: whether the estimates are of one machine.
     """
     from ambid.job import compare
 
     with (
-        Outputs(v.record, v.validate, **v.outputs) as outputs,
+        Outputs(v.record, v.validate, v.rig, **v.outputs) as outputs,
         progress("compare") as tick,
     ):
-        how = v.only("input output reference open_loop from_s to_s rate_hz gaps layout validate holdout")
+        how = v.only("input output reference rig open_loop from_s to_s rate_hz gaps layout validate holdout")
         found = compare(v.record, v.candidates, **how, tick=tick)
         outputs.give(found, tick)
     outputs.show(found, strict=v.strict)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from functools import partial
 from typing import TYPE_CHECKING
 
 import typer
@@ -15,7 +14,6 @@ from ambid.cli.interrupts import INTERRUPTED, Stop, interruptible, signals
 from ambid.cli.options import Values, refuse_twice, verb
 from ambid.cli.output import Outputs, end, keeping
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError, EstimationError
 from ambid.settings.caller import refuse_given
 
 if TYPE_CHECKING:
@@ -33,7 +31,6 @@ def command(v: Values) -> None:
     of the rig. Ctrl-C then keeps the best so far (exit code 130).
     """
     from ambid.job import identification as job
-    from ambid.job.files import EXPORT_ENDINGS
 
     stop, kept = Stop(), tuple(v.held or ())
     own, how = v.only("eddy drift"), v.only("from_s to_s rate_hz gaps validate")
@@ -42,7 +39,6 @@ def command(v: Values) -> None:
     with keeping(v, "identify", [*v.records, *kept], **asked) as store:
         with Outputs(*v.records, *kept, v.rig, v.validate, v.experiment, **v.outputs) as outputs:
             refuse_twice([*v.records, *kept])
-            outputs.claim(v.export, "export", EXPORT_ENDINGS)
             if v.nonlinear:
                 refuse_given(v.only("speed_rpm"), "{} is for rotors with a linear model. Omit {}")
                 refuse_given(v.only("experiment"), "{} is for the linear model. Omit {}")
@@ -57,21 +53,11 @@ def command(v: Values) -> None:
                 )
                 stop.torn()
                 outputs.give(estimate, show)
-                refused: AmbidError | None = None
-                if v.export is not None:
-                    from ambid.job.exchange import write_plant  # much is loaded for it
-
-                    try:
-                        outputs.stage(v.export, partial(write_plant, estimate, name=v.export.stem))
-                    except EstimationError as error:  # the estimate is given all the same
-                        refused = error
         outputs.show(estimate)
         search = getattr(estimate, "global_search", None)
         if stop.wished() or (search is not None and search["interrupted"]):
             raise typer.Exit(stop.code or INTERRUPTED)
         store(estimate)
-    if refused is not None:
-        raise refused
     end(failed=v.strict and not estimate.passed)
 
 

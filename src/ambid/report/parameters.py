@@ -236,7 +236,9 @@ def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
     first = "Some of the calibration is in no interval. " if stated else "Intervals are from this record alone. "
     lines = list[str]()
     if words:
-        lines.append(f"{first}1 % of gain moves: {'; '.join(words)}. Give gain_sd and rate_sd in the rig")
+        unweighed = not any(p.role != "free" and p.value for p in e.parameters)
+        weigh = ", or weigh one thing: with m fixed, a wrong factor or clock shows" if unweighed else ""
+        lines.append(f"{first}1 % of gain moves: {'; '.join(words)}. Give gain_sd and rate_sd in the rig{weigh}")
     if planes:
         span = e.plant.span(e.numbers)  # type: ignore[union-attr]  # only rotors have planes
         off = f"{sized(0.01 * span, 'm')} along the shaft moves most: {'; '.join(planes)}"

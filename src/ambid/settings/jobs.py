@@ -21,7 +21,7 @@ _JOBS = (
     declare(
         "identify",
         "records rig nonlinear held eddy drift speed_rpm experiment validate from_s to_s rate_hz "
-        "gaps layout json plot report export ledger bearing taken_at strict",
+        "gaps layout json plot report ledger bearing taken_at strict",
         validate={"help": "Validate the estimate on this second record."},
         plot={
             "help": "Draw signals, residuals, Bode and poles; with @identify_nonlinear curves with bands, and "
@@ -58,7 +58,7 @@ _JOBS = (
     ),
     declare(
         "compare",
-        "record candidates output input reference open_loop from_s to_s rate_hz gaps layout validate holdout json "
+        "record candidates output input reference rig open_loop from_s to_s rate_hz gaps layout validate holdout json "
         "plot report strict",
     ),
     declare(
