@@ -18,10 +18,10 @@ unexport PIP_TARGET
 unexport PIP_USER
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all tests lint types firmware peers bench docs format changelog lock clean distclean
+.PHONY: help setup demo test test-all tests lint types firmware peers bench docs format changelog transcripts lock clean distclean
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-11s %s\n", $$1, $$2 }'
 
 setup: $(VENV)/.setup  ## make .venv with ambid and its tools, from hash-pinned versions (PYTHON=... chooses the Python)
 
@@ -89,6 +89,9 @@ format: setup  ## rewrite the files in the project's format
 
 changelog: setup  ## make CHANGELOG.md from changes/
 	@$(BIN)/python tools/changelog.py
+
+transcripts: setup  ## run the commands of README and docs, and put what they print into their transcripts
+	@$(BIN)/python tools/transcripts.py
 
 lock: setup  ## pin the newest allowed versions again (needs the package index)
 	@sh tools/lock.sh $(BIN)/python
