@@ -1,4 +1,4 @@
-"""The README's own track: how often its 95 % bands hold the truth, parameter by parameter, over many records.
+"""The track of docs/online.md: how often its 95 % bands hold the truth, parameter by parameter, over many records.
 
 The lines of one record share their data and their start: within a record a band holds the truth nearly always or
 nearly never. Only the mean over records tells whether the standard deviations are right, and its spread how surely.
@@ -102,10 +102,10 @@ def coverage_tables() -> Iterator[Table]:
             print("; ".join(row), flush=True)
     before = (
         f"The unstable bearing at 20 kHz, start from its first {START_S:g} s, a line each 10 ms. `change` is the record"
-        f" of the README: k_i falls by 15 % at {AT_S:g} s. Share of the lines that are not stale whose band contains"
-        f" the true value, mean over {SEEDS} records ({DRIFTS} of the drift) ± its standard error. In `change`, k_i is"
-        " outside from the change to its detection, some 10 ms, and stale until its new value is accepted. In the last,"
-        f" R rises by {SLOPE:.2%} a second from {START_S:g} s on."
+        f" of [this page](online.md): k_i falls by 15 % at {AT_S:g} s. Share of the lines that are not stale whose"
+        f" band contains the true value, mean over {SEEDS} records ({DRIFTS} of the drift) ± its standard error. In"
+        " `change`, k_i is outside from the change to its detection, some 10 ms, and stale until its new value is"
+        f" accepted. In the last, R rises by {SLOPE:.2%} a second from {START_S:g} s on."
     )
     yield Table(group=GROUP, columns=COLUMNS, rows=tuple(rows), before=before, remarks=tuple(remarks), data=data)
 
