@@ -18,7 +18,7 @@ from math import hypot
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-WHOLE = ("README", "quickstart", "nonlinear")  # every command runs, and uses files of those before it
+WHOLE = ("README", "quickstart", "nonlinear", "better_loop")  # every command runs, and uses files of those before it
 OTHERS = ("online", "acquisition")  # a block that a transcript follows runs by itself
 _ELSEWHERE = (
     "make",

@@ -187,22 +187,15 @@ def test_a_transcript_that_has_drifted_is_told_and_made_anew(now, complaint):
     assert lost == []
 
 
-def test_the_way_to_a_better_loop_can_be_gone(tmp_path, monkeypatch, capsys):
-    from ambid.cli.app import run_verb
-
-    monkeypatch.chdir(tmp_path)
+def test_the_way_to_a_better_loop_can_be_gone(run, tmp_path, monkeypatch):
     monkeypatch.setattr("ambid.job.controller_design._JUDGES", 10)
-    said: dict[str, str] = {}
-    page = ROOT / "docs" / "better_loop.md"
-    for piece in blocks(page, "sh"):
-        for line in piece.splitlines():
-            words = shlex.split(line)
-            if words[1:3] == ["design", "controller"]:  # what it finds its own tests say
-                words = [*(w for w in words if w not in ("--report", "design.html")), "--plants", "10"]
-            assert run_verb(words[1:]) == 0, line
-            said[" ".join(words[1:3])] = capsys.readouterr().out
-    assert "✓ experiment" in said["identify second.h5"]
-    assert "peak of sensitivity" in said["design controller"]
+    said = ""
+    for piece, printed in played(
+        "better_loop", lambda line: run(f"{line} --plants 10" if " controller " in line else line)
+    ):
+        assert piece.shown is None or differences(piece.shown, printed) == []
+        said += printed
+    assert "✓ experiment" in said
     assert (tmp_path / "better.toml").exists()
 
 
