@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,9 +12,9 @@ import pytest
 from ambid import preset, simulate
 from ambid.console.folder import Folder
 from ambid.console.runs import Run, Runs, usual_times
-from ambid.console.worker import Worker
+from ambid.console.worker import JOBS, Worker
 from ambid.errors import AmbidError
-from ambid.job import identify, load
+from ambid.job import acquiring, identify, load
 from ambid.job import presentation as room
 from ambid.record import write_record
 from ambid.rig import draft_rig, preset_text, rig_from_text
@@ -137,6 +138,20 @@ def test_an_output_whose_line_is_lost_is_not_told_to_be_off(worker):
     with worker.minded(SimpleNamespace(stop=lost)):
         worker.wished.set()
     worker.end("failed", "the line is lost")
+    assert not told(until(worker.run), "off")
+
+
+def test_an_output_whose_line_is_lost_in_a_trial_is_not_told_to_be_off(worker, monkeypatch):
+    def lost(*_args, **_more):
+        raise AmbidError("the line is lost")
+
+    prototype_rig(worker.folder)
+    worker.spec.update(LIVE, out="run.h5", pace="fastest")
+    monkeypatch.setattr(acquiring, "opened", lambda *_args, **_more: nullcontext(SimpleNamespace(stop=lost)))
+    monkeypatch.setattr(acquiring.Request, "course", lost)
+    with pytest.raises(AmbidError, match="the line is lost"):
+        JOBS["live"](worker)
+    worker.end("refused", "the line is lost")
     assert not told(until(worker.run), "off")
 
 

@@ -59,10 +59,8 @@ class Worker:
         self.flags: deque[Order] = deque()
         self.cancelled = "cancelled before a result was there"
         self._question, self._asks, self._follows = 0, False, False
-        self._powered, self._off = (
-            False,
-            False,
-        )  # whether a device may have its output on; whether it was told to be off
+        self._powered = False  # whether a device may have its output on
+        self._off = False  # whether its output was told to be off
         self._answers: deque[Order] = deque()
         self._began = time.perf_counter()
         self._verdict_s: float | None = None  # when the result was told
@@ -396,9 +394,9 @@ def _live(worker: Worker) -> None:
         _before_others()
     opening = ready(
         str(spec["port"]), rig, wanted, bench=None, pace=spec.get("pace", "real-time"), force=False, note=worker.note,
-        tick=worker.tick,
+        tick=worker.tick, minded=worker.minded,
     )  # fmt: skip
-    with opening as (bare, course), worker.minded(bare) as device:
+    with opening as (device, course):
         view = BenchView(device.info, rig, shown)
         told = _Lines(worker, orders=rig.rotor is None)
         opening_record = recording(device, rig, out, course, on_trouble=lambda e: worker.note(str(e)))

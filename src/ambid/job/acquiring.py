@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -260,8 +260,11 @@ def ready(
     force: bool,
     note: Note,
     tick: Tick | None,
+    minded: Callable[[Device], AbstractContextManager[Device]] = nullcontext,
 ) -> Iterator[tuple[Device, Course]]:
-    """Open a device, say what it is to do, and close it; arguments as those of `acquire`."""
+    """Open a device, say what it is to do, and close it; arguments as those of `acquire`. `minded`: in which the device
+    is used, trials of an amplitude too.
+    """
     trial, say = wanted.trial(port, rig), tick or silent
     closes = trial.mode == "levitate" and not force
     if wanted.arm is not None and trial.mode != "levitate":
@@ -273,7 +276,8 @@ def ready(
         raise AmbidError(
             f"{setting('arm')} is tried by the firmware alone. Give {setting('port', 'emulated')}, or a serial port"
         )
-    with opened(port, rig, bench=bench, pace=pace, seed=wanted.seed, closes=closes, note=note) as device:
+    opening = opened(port, rig, bench=bench, pace=pace, seed=wanted.seed, closes=closes, note=note)
+    with opening as bare, minded(bare) as device:
         course = wanted.course(device, rig, trial, note=note, tick=say)
         if wanted.arm is not None:
             complete = with_default_daq(rig) if port in ("emulated", "simulated") else rig
