@@ -3,16 +3,19 @@
 import time
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from ambid.acquisition.program import program
 from ambid.acquisition.session import Course, acquire
 from ambid.errors import AmbidError, DeviceError
 from ambid.job import identify
-from ambid.job.track_live import track_live
+from ambid.job.track_live import RingTap, track_live
 from ambid.record import read_record
 from ambid.rig import rig_from_text
+from ambid.tracking.blocks import Block, Frame
 from tests.acquisition.scripted import Listener
 from tests.job.benches import PROTOTYPE_FILE, Spoiled, prototype
 
@@ -249,3 +252,19 @@ def test_a_record_made_meanwhile_is_whole(start, tmp_path):
     with Spoiled(RIG) as device, recording(device, RIG, tmp_path / "o.h5", course(2.0)) as tap:
         track_live(device, RIG, course(2.0), start=start, taps=[tap], on_event=tap.tell)
     assert len(read_record(tmp_path / "o.h5").channels[0].values) == 4000
+
+
+def test_a_run_that_is_stopped_waits_for_no_room_in_the_ring():
+    """A start is identified, nobody reads, and the ring is full."""
+    looks = []
+
+    def stopped():
+        looks.append(len(looks))
+        return len(looks) > 3
+
+    put = []
+    ring = SimpleNamespace(wait_for_room=lambda _s: len(looks) > 99, put=lambda block, _s: put.append(block))
+    view = SimpleNamespace(block=lambda block: block)
+    tap = RingTap(ring, view, waits=True, stopped=stopped)
+    tap.take(Frame(block=Block(first=5, time_s=0.0, values=np.zeros((3, 1))), arrived_s=0.0))
+    assert (len(looks), put[0].first) == (4, 0)

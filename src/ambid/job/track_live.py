@@ -96,7 +96,7 @@ def track_live(
     with BlockRing.create(
         rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
     ) as ring:
-        ring_tap = RingTap(ring, view, waits=device.info.kind != "serial")
+        ring_tap = RingTap(ring, view, waits=device.info.kind != "serial", stopped=stopped)
         job = partial(run, device, course, taps=(*taps, ring_tap), on_event=on_event)  # who records is never behind
         runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
         with runner:
@@ -218,11 +218,14 @@ def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
 class RingTap:
     """Puts what a device samples into the ring, by the rig's `view`, numbered from its first sample, uncovered by
     calibration as NaN, rejected and counted. A real bench waits for nobody, and blocks lost to a full ring are counted;
-    one that is only played is held up (`waits`). `over`: set when nobody reads; `fresh`: when a block is put in.
+    one that is only played is held up (`waits`) until it is `stopped`. `over`: set when nobody reads; `fresh`: when a
+    block is put in.
     """
 
-    def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
-        self._ring, self._view, self._waits = ring, view, waits
+    def __init__(
+        self, ring: BlockRing, view: BenchView, *, waits: bool, stopped: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._ring, self._view, self._waits, self._stopped = ring, view, waits, stopped
         self._origin: int | None = None
         self.over, self.fresh = Signal(), Signal()
 
@@ -231,7 +234,7 @@ class RingTap:
         block = self._seen(frame.block)
         if self._origin is None:
             self._origin = block.first
-        while self._waits and not self.over.is_set() and not self._ring.wait_for_room(LOOK_S):
+        while self._waits and not (self.over.is_set() or self._stopped() or self._ring.wait_for_room(LOOK_S)):
             pass
         self._ring.put(
             Block(first=block.first - self._origin, time_s=block.time_s, values=block.values), frame.arrived_s
