@@ -135,3 +135,43 @@ def test_a_bomb_is_refused(tmp_path, monkeypatch):
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"0,0\n" * (1 << 18)))
     with pytest.raises(RecordError, match="over 200 times its size"):
         read_record(tmp_path / "a.csv.gz")
+
+
+_SIGNALS = "".join(f"{k % 5 - 2},{k % 7 - 3},{k % 3 - 1}\n" for k in range(12))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Sample rate: 50k",
+        "Sample rate: 50 kSa",
+        "Sample rate: 50,000 Hz",
+        "Abtastrate: 50.000 Hz",
+        "dt = 0.02",
+        "fs = 50",
+    ],
+)
+def test_a_rate_that_may_be_a_thousand_times_another_is_asked_for(tmp_path, line):
+    path = tmp_path / "a.csv"
+    path.write_text(f"{line}\nu [V],i [A],x [m]\n{_SIGNALS}")
+    with pytest.raises(RecordError, match="rate_hz"):
+        read_record(path)
+    assert read_record(path, rate_hz=50e3).rate_hz == 50e3
+
+
+@pytest.mark.parametrize(
+    ("line", "rate_hz"),
+    [("fs = 50 Hz", 50.0), ("dt = 0.02 s", 50.0), ("dt = 1.000 ms", 1e3), ("Sample rate: 25.000 kHz", 25e3),
+     ("dt = 0.001", 1e3), ("fs = 2000", 2e3), ("Samples per second: 100", 100.0)],
+)  # fmt: skip
+def test_a_rate_with_its_unit_is_taken(tmp_path, line, rate_hz):
+    path = tmp_path / "a.csv"
+    path.write_text(f"{line}\nu [V],i [A],x [m]\n{_SIGNALS}")
+    assert read_record(path).rate_hz == rate_hz
+
+
+def test_a_temperature_called_t_is_not_the_time_where_another_column_is(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("Zeit [s],T,u [V]\n" + "".join(f"{k / 1000},{20 + k % 2},{k % 5}\n" for k in range(12)))
+    record = read_record(path)
+    assert (record.rate_hz, record.names) == (1000.0, ("T", "u"))

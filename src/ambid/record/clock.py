@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
@@ -40,23 +41,31 @@ def clock_of(
     if word is not None and word not in names:
         raise RecordError(f"{where} has no column {word!r}; it has {choices(word, names)} Correct layout time")
     at = None if word is None else list(names).index(word)
-    if at is None:
-        at = next((j for j, name in enumerate(names) if name.lower() in TIME_NAMES), None)
-        if at is not None:
-            return Clock(column=at)
-    why = "the layout says so"
+    called = [j for j, name in enumerate(names) if name.lower() in TIME_NAMES] if at is None else []
     rising = [j for j, x in enumerate(columns) if rises(x)]
     kinds = [unit_or_none(u if u is not None else unit_within(n)) for n, u in zip(names, units, strict=True)]
     second = [unit is not None and unit.si == "s" for unit in kinds]
     unlike = [unit is not None and unit.si != "s" for unit in kinds]
+    if called and called[0] in rising and not unlike[called[0]]:
+        return Clock(column=called[0])
+    why = "the layout says so"
     for fits, reason in (
         ([is_time(n) and not bad for n, bad in zip(names, unlike, strict=True)], "its name says so, and it rises"),
         (second, "it is in a unit of time, and rises"),
     ):
         if at is None:
             at, why = next((j for j in rising if fits[j]), None), reason
-    told = [(key, r) for key, (x, unit) in (beside or {}).items() if (r := rate_of(key, x, unit)) is not None]
+    if at is None and called:  # what is wrong with it is told where rates are checked
+        return Clock(column=called[0])
+    rates = {key: rate_of(key, x, unit) for key, (x, unit) in (beside or {}).items()}
+    told = [(key, found[0]) for key, found in rates.items() if found is not None]
     if at is None and rate_hz is None and told:
+        key, low = min(told, key=itemgetter(1))
+        if low < _USUAL and rates[key] == (low, False):
+            raise RecordError(
+                f"{where}: {key} has no unit; it may say {low:g} Hz or {1000 * low:g} Hz. Say which: "
+                f"{setting('rate_hz')}"
+            )
         if max(r for _, r in told) > 1.01 * min(r for _, r in told):
             listed = ", ".join(f"{key} says {r:g} Hz" for key, r in told)
             raise RecordError(f"{where}: {listed}. Say which is right: {setting('rate_hz')}")

@@ -13,7 +13,7 @@ from typing import Any
 
 from ambid.errors import RecordError
 from ambid.record.record import utf8_text
-from ambid.record.words import is_time, label_of, quantities, unit_or_none
+from ambid.record.words import is_time, label_of, quantities, rate_of, unit_or_none
 from ambid.settings.caller import setting
 
 _WORDS = {
@@ -36,6 +36,7 @@ _NAMED_NUMBER = re.compile(
     r"(?P<unit>[A-Za-zµμ]{0,3})"
 )
 _HEAD = 1 << 14  # bytes in which the words of an encoding are looked for
+_FASTEST = 2e6  # Hz, of a bearing
 _FEW = 8  # rows of numbers below a header, without which a text is no table
 
 
@@ -329,9 +330,17 @@ def _beside(lines: Sequence[str]) -> dict[str, tuple[float, str | None]]:
     pairs: dict[str, tuple[float, str | None]] = {}
     for line in lines:
         match = _NAMED_NUMBER.fullmatch(line.lstrip("#%").strip().rstrip(",;\t "))
-        if match:
+        if match and not _thousandfold(**match.groupdict()):
             pairs[match["name"].strip()] = (float(match["number"].replace(",", ".")), match["unit"] or None)
     return pairs
+
+
+def _thousandfold(name: str, number: str, unit: str) -> bool:
+    """Whether a rate may be 50 or 50 000 Hz, as ``50.000`` and ``50,000`` say."""
+    if not re.fullmatch(r"[1-9]\d{0,2}[.,]\d{3}", number):
+        return False
+    readings = [rate_of(name, float(number.replace(",", mark).replace(".", mark)), unit or None) for mark in (".", "")]
+    return all(x is not None and x[0] <= _FASTEST for x in readings)
 
 
 def _is_unit(text: str) -> bool:

@@ -124,15 +124,17 @@ def unit_within(name: str) -> str | None:
     return last if unit is not None and any(_KINDS.get(k) == unit.si for k in quantities(rest)) else None
 
 
-def rate_of(name: str, value: float, text: str | None = None) -> float | None:
-    """Return the sampling rate in Hz that a number beside the data tells: ``fs``, ``dt`` and the like; else None."""
+def rate_of(name: str, value: float, text: str | None = None) -> tuple[float, bool] | None:
+    """Return the sampling rate in Hz that a number beside the data tells, ``fs``, ``dt`` and the like, and whether a
+    unit says so; else None, also where the unit is not known (``50 k``).
+    """
     plain = _words(name)[0]
     called, inside = label_of(plain)
     ending = re.fullmatch(r"(.*[^_\W])[_ ](k?hz|m?s|us)", called)
     if ending and text is None and inside is None:
         called, inside = ending[1], {"hz": "Hz", "khz": "kHz"}.get(ending[2], ending[2])
     key, unit = re.sub(r"[^\w]|_(?!s\b)", "", called), unit_or_none(text or inside)
-    if not value > 0:
+    if not value > 0 or (unit is None and (text or inside)):
         return None
     if _RATE.fullmatch(key) and (unit is None or unit.si == "Hz"):
         rate = value if unit is None else unit.to_si(value)
@@ -140,4 +142,5 @@ def rate_of(name: str, value: float, text: str | None = None) -> float | None:
         rate = 1.0 / (value if unit is None else unit.to_si(value))
     else:
         return None
-    return float(f"{rate:.10g}") if 20.0 <= rate <= 1e8 else None
+    sure = unit is not None or key == "samplespersecond"
+    return (float(f"{rate:.10g}"), sure) if 20.0 <= rate <= 1e8 else None
