@@ -52,6 +52,19 @@ def test_an_orbit_is_that_of_the_unbalance():
     assert len(feed.said) == 1 + 10  # every 0.2 s
 
 
+def test_where_a_rotor_stands_is_no_part_of_what_turns_with_it():
+    """Seven turns and a half in the window, and a mean twenty times as large as the orbit."""
+    feed, device = Heard(), RotorDevice(RIG)
+    orbits, t = Orbits(feed, RIG, device.info), np.arange(22_000) / 20_000
+    angle = 2.0 * np.pi * 7.5 * t
+    values = {"position": 1e-4 + 5e-6 * np.cos(angle), "angle": angle}
+    rows = np.column_stack([values.get(c.role.rpartition("_")[2], 0.0 * t) for c in device.info.columns])
+    for k in range(0, t.size, 200):
+        orbits.take(rows[k : k + 200], float(t[k]) + 0.01)
+    real, imaginary, *_ = feed.said[-1][1]["turning"]["A"]
+    assert math.isclose(math.hypot(real, imaginary), 5e-6, rel_tol=0.05)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("rotor")

@@ -42,7 +42,7 @@ class Orbits:
         self._angle = ["angle"] if any(c.role == "angle" for c in rig.channels) else []
         self._view = BenchView(info, rig, [*roles, *self._angle])
         self._of = {b.name: slice(2 * k, 2 * k + 2) for k, b in enumerate(radial)}
-        self._speed, self._sums = rotor.speed, deque[tuple[int, Complex]]()
+        self._speed, self._sums = rotor.speed, deque[tuple[int, Complex, complex, Array]]()
         turn_s = 2.0 * math.pi / abs(rotor.speed) if rotor.speed else _STILL_S / _TURNS
         self._n = max(8, round(_TURNS * turn_s * info.rate_hz))
         self._recent = np.empty((0, len(roles)))
@@ -66,16 +66,24 @@ class Orbits:
         self._recent = np.vstack([self._recent, positions])[-self._n :]
         if self._speed or self._angle:
             at = values[:, -1] if self._angle else self._speed * (end_s - np.arange(n, 0, -1) / self._rate_hz)
-            self._sums.append((n, np.exp(-1j * at) @ positions))
-            while sum(k for k, _ in self._sums) > _WINDOW_S * self._rate_hz + n:
+            back = np.exp(-1j * at)
+            self._sums.append((n, back @ positions, complex(back.sum()), positions.sum(axis=0)))
+            while sum(k for k, *_ in self._sums) > _WINDOW_S * self._rate_hz + n:
                 self._sums.popleft()
         if end_s - self._told_s < _EVERY_S or len(self._recent) < self._n:
             return
         self._told_s, step = end_s, -(-self._n // _POINTS)
         of = {name: [rounded(x, 4) for x in self._recent[::step, pair].T] for name, pair in self._of.items()}
-        a = 2.0 * sum(x for _, x in self._sums) / max(1, sum(k for k, _ in self._sums))
-        turning = {name: rounded(np.asarray(a)[pair].view(np.float64), 4) for name, pair in self._of.items()}
-        self._feed.tell("orbits", {"t": round(end_s, 4), "of": of, "turning": turning if self._sums else {}})
+        a = self._turning()
+        turning = {name: rounded(a[pair].view(np.float64), 4) for name, pair in self._of.items() if a.size}
+        self._feed.tell("orbits", {"t": round(end_s, 4), "of": of, "turning": turning})
+
+    def _turning(self) -> Complex:
+        """Return what turns with the rotor about the mean, whose part in an odd piece of a turn is none of it."""
+        if not self._sums:
+            return np.empty(0, dtype=np.complex128)
+        n, whole, back, rest = (sum(parts) for parts in zip(*self._sums, strict=True))
+        return np.asarray(2.0 / n * (whole - back / n * rest))
 
 
 def loop_content(t: float, sensitivity: Mapping[str, Any]) -> Mapping[str, Any]:
