@@ -10,6 +10,7 @@ from ambid.acquisition.devices import open_device
 from ambid.acquisition.session import Course
 from ambid.control.zones import Zone
 from ambid.errors import DeviceError, EstimationError
+from ambid.job import track_rotor
 from ambid.job.acquiring import Request
 from ambid.job.track_live import track_live
 from ambid.physics.presets import preset
@@ -55,6 +56,20 @@ def test_every_axis_is_followed_with_its_sensitivity(start):
         assert {z.source for z in zones.values()} == {"measured"}
         for axis, zone in zones.items():
             assert zone.peak_db == pytest.approx(start.sensitivity[axis]["peak_db"]["value"], abs=0.5)
+
+
+def test_a_loop_that_is_unstable_by_the_numbers_of_now_keeps_no_sensitivity_of_before(start, monkeypatch):
+    told, loops = [], []
+
+    def refuses(loop, rig):
+        loops.append(loop)
+        if len(loops) > 1:
+            raise EstimationError("the loop is not stable")
+
+    monkeypatch.setattr(track_rotor, "refuse_unstable", refuses)
+    with open_device("simulated", RIG, seed=4) as device:
+        track_live(device, RIG, excited(RIG, 14.0), start=start, on_loop=lambda _, found: told.append(set(found)))
+    assert told == [set(RIG.rotor.axes), set()]
 
 
 def test_a_bench_that_is_not_as_the_start_says_is_found(start):

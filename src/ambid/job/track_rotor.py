@@ -250,7 +250,8 @@ class _Judge:
         try:
             loop = ClosedLoop.of(plant, controller_of(plant, self._rig, self._spectra))
             refuse_unstable(loop, self._rig)
-        except EstimationError:  # as an estimate, which has then no sensitivity
+        except EstimationError:  # as an estimate, which has then no sensitivity: that of before holds no more
+            self._on_loop(f.t0 + at / f.rate_hz, {})
             return
         found = sensitivity_by_axis(loop, measure(loop, None, self._spectra))
         self._on_loop(f.t0 + at / f.rate_hz, plain_json(found))

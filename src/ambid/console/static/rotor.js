@@ -31,7 +31,8 @@ export class RotorView {
     el("p", { className: "hint" }, rows.length ? `Opened at the position, ISO 14839-3; ± is the 95 % interval; at ${m.t.toFixed(1)} s. ` +
       (predicted === rows.length ? "Predicted: by the estimate, not measured in this run."
         : `Measured at the excited lines of this run${predicted ? "; predicted where the estimate's peak is surely higher" : ""}.`)
-      : "No sensitivity can be told: neither a reference nor the rig says what the controller is."));
+      : `No sensitivity can be told at ${m.t.toFixed(1)} s: neither a reference nor the rig says what the controller is, ` +
+        "or the loop is not stable with the numbers as they are now."));
   }
   draw() {
     this.dirty = false;
