@@ -70,3 +70,12 @@ def test_limits_are_in_the_units_of_what_is_drawn():
     assert of == {"the rotor touches": 1e-3, "trip": 0.9e-3}
     counts = {line["words"]: line["at"] for line in limits(rig, columns=True)["position"] if line["at"] > 512}
     assert counts == pytest.approx({"the rotor touches": 921.1, "trip": 880.1}, abs=0.1)
+
+
+def test_a_stretch_may_begin_or_end_at_zero():
+    """A scope's time begins before its trigger."""
+    t = np.arange(2000) / RATE - 0.5
+    record = Record(rate_hz=RATE, channels=(Channel(name="x", unit="m", values=t),), start_s=-0.5)
+    after, before = look(record, from_s=0.0), look(record, to_s=0.0)
+    assert (after["t"][0], after["samples"]) == (0.0, 1000)
+    assert (before["t"][0], before["samples"]) == (-0.5, 1001)

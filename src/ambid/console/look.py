@@ -34,7 +34,8 @@ def look(
     none of the name is there; `orbit`: two channels, the first in m by default.
     """
     whole = (record.start_s, record.start_s + (record.n_samples - 1) / record.rate_hz)
-    begin, end = max(whole[0], from_s or whole[0]), min(whole[1], to_s or whole[1])
+    begin = whole[0] if from_s is None else max(whole[0], from_s)
+    end = whole[1] if to_s is None else min(whole[1], to_s)
     if (end - begin) * record.rate_hz < 1.0:
         raise AmbidError(f"there is no sample from {begin:g} to {end:g} s. Show a longer stretch")
     part, names = cut(record, begin, end + 0.5 / record.rate_hz), [c.name for c in record.channels]
