@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.job import identify, info
+from ambid.job import drafting, identify, info
 from ambid.job.drafting import draft
 from ambid.rig import load_rig
 from tests.job.foreign_files import FILES, QUESTIONS, signals
@@ -115,3 +115,12 @@ def test_text_whose_columns_show_nothing_asks_and_shows_their_ranges(tmp_path):
         match=r"no column looks like the voltage or the current or the position; there are column 2 \[\?\] -",
     ):
         draft(tmp_path / "noise.txt")
+
+
+def test_where_neither_names_nor_the_record_show_roles_none_is_put_into_the_question(tmp_path, record, monkeypatch):
+    monkeypatch.setattr(drafting, "_trial", lambda *_: None)
+    np.savetxt(tmp_path / "bare.txt", np.column_stack([record.t, record.x, record.i, record.u]))
+    with pytest.raises(
+        AmbidError, match=r"which column is what; there are column 2 -.*column 4 .*'position': 'NAME \[m\]'"
+    ):
+        draft(tmp_path / "bare.txt")

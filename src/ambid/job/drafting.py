@@ -8,6 +8,7 @@ import contextlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from ambid.job.data import RigSource, known_rig
 from ambid.physics.linear_model import LinearModel, model
 from ambid.record import NAMED, GapPolicy, Record, Source, format_of, read_record
 from ambid.record.record import Channel
-from ambid.record.words import label_of, unit_or_none, unit_within
+from ambid.record.words import label_of, quantities, unit_or_none, unit_within
 from ambid.rig import read_bench
 from ambid.rig.draft import axes_of, draft_rig, model_of
 from ambid.rig.roles import ROLES, Candidate, close, rank_roles, unit_of
@@ -271,6 +272,13 @@ def _of_sizes(
     if found is None:
         role = next(role for role in ("position", "current", "voltage") if role in bare)
         c = chosen[role]
+        if not any(quantities(chosen[x].name) for x in bare):
+            unknown = sorted(chosen.values(), key=attrgetter("name"))  # not by roles that nothing speaks for
+            listed = ", ".join(f"{x.name} {np.nanmin(x.values):.4g} … {np.nanmax(x.values):.4g}" for x in unknown)
+            asked = ", ".join(setting("column", f"{x}=NAME [{ROLES[x]}]") for x in chosen if x in bare)
+            return (
+                f"neither name nor unit nor the record shows which column is what; there are {listed}. Say it: {asked}"
+            )
         return (
             f"column {c.name!r} has no unit, and the record does not show which (its values reach "
             f"{np.nanmin(c.values):.4g} to {np.nanmax(c.values):.4g}). Say it: "
