@@ -1,6 +1,8 @@
 """Damaged CSV records: each is refused in one line that says where and what to do."""
 
 import gzip
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -159,3 +161,63 @@ def test_unknown_gap_policy(tmp_path):
     path.write_bytes(text(rows()))
     with pytest.raises(RecordError, match="interpolate"):
         read_record(path, gaps="fill")
+
+
+@pytest.mark.parametrize("head", ["fs [kHz]: 20", "Sample rate (kHz),20", "fs = 0.02 MHz"])
+def test_a_rate_above_the_numbers_is_in_its_unit(tmp_path, head):
+    (tmp_path / "r.csv").write_text(head + "\nu [V],i [A]\n" + _rows(20), encoding="utf-8")
+    assert read_record(tmp_path / "r.csv").rate_hz == 20_000.0
+
+
+@pytest.mark.parametrize(
+    "head", ["Abtastrate: 20.000 Hz", "rate: 200,000 Hz", "fs = 20", "fs [parsec]: 2000", "dt [furlong]: 0.001"]
+)
+def test_a_rate_above_the_numbers_that_could_be_another_is_not_taken(tmp_path, head):
+    (tmp_path / "r.csv").write_text(head + "\nu [V];i [A]\n" + _rows(20).replace(",", ";"), encoding="utf-8")
+    with pytest.raises(RecordError, match="no rate is given"):
+        read_record(tmp_path / "r.csv")
+
+
+def test_time_of_no_usual_rate_is_asked_back(tmp_path):
+    body = "".join(f"{45000 + k / 1.728e9:.12f},{k % 3}\n" for k in range(50))  # days, as Excel counts them
+    (tmp_path / "r.csv").write_text("Time,u [V]\n" + body, encoding="utf-8")
+    with pytest.raises(RecordError, match="it may be in s, ms or us"):
+        read_record(tmp_path / "r.csv")
+
+
+def test_a_quote_without_end_is_refused_in_one_line(tmp_path):
+    (tmp_path / "r.csv").write_text("time [s],u [V]\n" + '"' * 200_000, encoding="utf-8")
+    with pytest.raises(RecordError, match="1 row"):
+        read_record(tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize("head", ["", ",".join(f"c{k}" for k in range(100_000)) + "\n"])
+def test_a_hundred_thousand_columns_are_refused_at_once(tmp_path, head):
+    (tmp_path / "r.csv").write_text(head + ("1.5," * 99_999 + "2\n") * 9, encoding="utf-8")
+    began = time.perf_counter()
+    with pytest.raises(RecordError, match="100000 columns; a record has at most"):
+        read_record(tmp_path / "r.csv")
+    assert time.perf_counter() - began < 20.0
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "r.csv")
+    with pytest.raises(RecordError, match="a device or a pipe"):
+        read_record(tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize(
+    "notes", ["[" * 100_000, "{}", "[]", "null", '{"sha256": 1, "rdfs:comment": {}}', "\x00", "x" * (3 << 20), None]
+)
+def test_notes_beside_that_are_none_change_nothing(tmp_path, notes):
+    (tmp_path / "r.csv").write_text("time [s],u [V]\n" + "".join(f"{k / 100},{k}\n" for k in range(9)))
+    beside = tmp_path / "r.csv-metadata.json"
+    if notes is None:
+        os.mkfifo(beside)
+    else:
+        beside.write_text(notes, encoding="utf-8")
+    assert "comment" not in read_record(tmp_path / "r.csv").provenance
+
+
+def _rows(n):
+    return "".join(f"{k},{k % 3}\n" for k in range(n))

@@ -118,7 +118,9 @@ def unit_words(time: Array, name: str, text: str | None) -> str:
     if text is not None:
         return ""
     within = unit_within(name)
-    return f"in [{within}] by its name" if within else f"in [{_plausible(time)[0]}], in which its rate is a usual one"
+    if within:
+        return f"in [{within}] by its name"
+    return "".join(f"in [{unit}], in which its rate is a usual one" for unit in _plausible(time)[:1])
 
 
 def _unit_of_steps(time: Array, name: str, where: str, rate_hz: float | None) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,10 @@ _NAMED_NUMBER = re.compile(
     rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d*[.,]?\d+{_POWER})\s*[,;\t]?\s*"
     r"(?P<unit>[A-Za-zµμ]{0,3})"
 )
+_EITHER = re.compile(r"[1-9]\d{0,2}[.,]\d{3}")  # with a decimal mark or a thousands separator: nobody knows
 _HEAD = 1 << 14  # bytes in which the words of an encoding are looked for
 _FASTEST = 2e6  # Hz, of a bearing
+_MOST_COLUMNS = 4096
 _FEW = 8  # rows of numbers below a header, without which a text is no table
 
 
@@ -98,6 +101,14 @@ def words_of(layout: Mapping[str, str], path: Path) -> dict[str, str]:
     return words
 
 
+def refuse_width(n: int, row: int, path: Path) -> None:
+    """Refuse more columns than a record of anything has."""
+    if n > _MOST_COLUMNS:
+        raise RecordError(
+            f"{path}, row {row}: {n} columns; a record has at most {_MOST_COLUMNS}. Export those of the bearing"
+        )
+
+
 def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Dialect | None:
     """Recognise a dialect; None where the text is usual, or no table. Raises where it could be read in two ways."""
     words = words_of(layout, path)
@@ -105,6 +116,7 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
     block = None if begin is None else _first_block(lines, words.get("separator"))
     if begin is None or block is None:
         return None
+    refuse_width(len(block.kinds), block.at + 1, path)
     heads = _heads(lines, block, path, words.get("units"))
     if heads is None:
         return None
@@ -146,7 +158,10 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
 
 def _cells(line: str, delimiter: str) -> list[str]:
     """Take a row apart; a delimiter within quotes is none."""
-    parts = next(csv.reader([line], delimiter=delimiter), [""]) if '"' in line else line.split(delimiter)
+    parts = line.split(delimiter)
+    if '"' in line:
+        with suppress(csv.Error):  # of a quote that nothing ends
+            parts = next(csv.reader([line], delimiter=delimiter), [""])
     return [x.strip() for x in parts]
 
 
@@ -330,7 +345,7 @@ def _beside(lines: Sequence[str]) -> dict[str, tuple[float, str | None]]:
     pairs: dict[str, tuple[float, str | None]] = {}
     for line in lines:
         match = _NAMED_NUMBER.fullmatch(line.lstrip("#%").strip().rstrip(",;\t "))
-        if match and not _thousandfold(**match.groupdict()):
+        if match and not (_thousandfold(**match.groupdict()) or _EITHER.fullmatch(match["number"])):
             pairs[match["name"].strip()] = (float(match["number"].replace(",", ".")), match["unit"] or None)
     return pairs
 

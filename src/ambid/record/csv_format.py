@@ -11,14 +11,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record.clock import TIME_NAMES, Clock, clock_of, dates, rises, seconds, unit_words
-from ambid.record.csv_dialect import decoded, recognised
-from ambid.record.record import Record, file_bytes, gunzipped, sha256_of
+from ambid.record.csv_dialect import decoded, recognised, refuse_width
+from ambid.record.record import Record, file_bytes, gunzipped, readable, sha256_of
 from ambid.record.sampling import (
     MIN_SAMPLES,
     GapPolicy,
@@ -218,11 +219,19 @@ def notes_text(name: str, data: bytes, comments: Sequence[str]) -> str:
 
 def notes_of(path: Path, digest: str) -> tuple[str, ...]:
     """Return the comments beside a CSV file of this SHA-256; none where there are none, or of another file."""
+    notes = notes_in(notes_path(path))
+    return tuple(map(str, notes["rdfs:comment"])) if notes.get("sha256") == digest else ()
+
+
+def notes_in(path: Path) -> Mapping[str, Any]:
+    """Return what `notes_text` wrote into a file; nothing where it is another one."""
     try:
-        notes = json.loads(notes_path(path).read_text(encoding="utf-8"))
-        return tuple(str(x) for x in notes["rdfs:comment"]) if notes["sha256"] == digest else ()
-    except (OSError, ValueError, KeyError, TypeError):
-        return ()
+        with readable(path) as file:
+            notes = json.loads(file.read(_LONGEST_NOTES).decode())
+    except (RecordError, ValueError, RecursionError):
+        return {}
+    whole = isinstance(notes, dict) and "sha256" in notes and isinstance(notes.get("rdfs:comment"), list)
+    return notes if whole else {}
 
 
 def head_lines(record: Record) -> list[str]:
@@ -239,6 +248,7 @@ _HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
 _BLOCK = 20_000  # rows that are read at once
 _FEW_CHANNELS = 64  # lines of which each may be a channel
 _LONG = 1 << 23  # bytes from which compiled reading saves more than loading it takes
+_LONGEST_NOTES = 1 << 20  # bytes
 _HEAD = 1 << 16  # bytes in which the header of a plain file ends
 
 
@@ -280,6 +290,7 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
 
 def _names_and_units(cells: Sequence[str], row: int, path: Path) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
     """Take the cells of a header row apart."""
+    refuse_width(len(cells), row, path)
     names, units = list[str](), list[str | None]()
     for j, cell in enumerate(cells, start=1):
         match = _HEADER_CELL.fullmatch(cell)

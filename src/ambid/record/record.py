@@ -489,6 +489,8 @@ def readable(path: Path, error: type[AmbidError] = RecordError, what: str = "rec
     if INSIDE and not any(path.resolve().is_relative_to(folder.resolve()) for folder in INSIDE):
         raise error(f"{what} {path} is outside of {INSIDE[0]}. Copy it into that folder")
     try:
+        if not path.is_file() and path.exists() and not path.is_dir():  # opening a pipe would wait for its writer
+            raise error(f"{what} {path} is a device or a pipe; it must be a file. Write what it gives into one")
         with path.open("rb") as file:
             yield file
     except FileNotFoundError:

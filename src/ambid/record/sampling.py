@@ -187,8 +187,9 @@ def _check_rate(table: Table, rate_hz: float | None) -> None:
     if rate_hz is not None:
         check_rate(rate_hz)
     if table.time is None and rate_hz is None:
+        names = [*table.names[:12], *(["…"] if len(table.names) > 12 else [])]
         raise RecordError(
-            f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
+            f"{table.where} has no column 'time [s]' (columns: {', '.join(names)}) and no rate is given."
             f" Add the column, name the one that is time with {setting('layout', 'time=NAME')}, or give "
             f"{setting('rate_hz')}"
         )

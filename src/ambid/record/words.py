@@ -128,8 +128,8 @@ def rate_of(name: str, value: float, text: str | None = None) -> tuple[float, bo
     """Return the sampling rate in Hz that a number beside the data tells, ``fs``, ``dt`` and the like, and whether a
     unit says so; else None, also where the unit is not known (``50 k``).
     """
-    plain = _words(name)[0]
-    called, inside = label_of(plain)
+    called, inside = label_of(name)
+    called = _words(called)[0]
     ending = re.fullmatch(r"(.*[^_\W])[_ ](k?hz|m?s|us)", called)
     if ending and text is None and inside is None:
         called, inside = ending[1], {"hz": "Hz", "khz": "kHz"}.get(ending[2], ending[2])
@@ -143,4 +143,4 @@ def rate_of(name: str, value: float, text: str | None = None) -> tuple[float, bo
     else:
         return None
     sure = unit is not None or key == "samplespersecond"
-    return (float(f"{rate:.10g}"), sure) if 20.0 <= rate <= 1e8 else None
+    return (float(f"{rate:.10g}"), sure) if 50.0 < rate <= 1e8 else None  # below, no bearing is sampled
