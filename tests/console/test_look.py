@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.console.look import limits, look
+from ambid.errors import AmbidError
 from ambid.record import Channel, Record
 from ambid.rig import load_rig
 from tests.job.benches import PROTOTYPE_FILE
@@ -79,3 +80,14 @@ def test_a_stretch_may_begin_or_end_at_zero():
     after, before = look(record, from_s=0.0), look(record, to_s=0.0)
     assert (after["t"][0], after["samples"]) == (0.0, 1000)
     assert (before["t"][0], before["samples"]) == (-0.5, 1001)
+
+
+@pytest.mark.parametrize("band", [(1000.0, None), (1e8, None), (50.0, 50.0), (90.0, 10.0), (0.0, -1.0)])
+def test_a_band_without_a_line_is_refused(band):
+    with pytest.raises(AmbidError, match="there is no line from"):
+        look(ramp(4000), from_hz=band[0], to_hz=band[1])
+
+
+@pytest.mark.parametrize("band", [(999.99, None), (-1e8, 1e8), (999.0, 1000.0), (0.0, 1e-9)])
+def test_the_narrowest_bands_are_drawn(band):
+    assert look(ramp(4000), from_hz=band[0], to_hz=band[1])["waterfall"]["hz"]

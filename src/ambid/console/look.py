@@ -38,6 +38,11 @@ def look(
     end = whole[1] if to_s is None else min(whole[1], to_s)
     if (end - begin) * record.rate_hz < 1.0:
         raise AmbidError(f"there is no sample from {begin:g} to {end:g} s. Show a longer stretch")
+    if not max(from_hz, 0.0) < min(to_hz or record.rate_hz / 2.0, record.rate_hz / 2.0):
+        raise AmbidError(
+            f"there is no line from {from_hz:g} to {to_hz or record.rate_hz / 2.0:g} Hz. Show a band up to "
+            f"{record.rate_hz / 2.0:g} Hz"
+        )
     part, names = cut(record, begin, end + 0.5 / record.rate_hz), [c.name for c in record.channels]
     signals, band = np.array([c.values for c in part.channels]), (from_hz, to_hz or record.rate_hz / 2.0)
     starts = np.arange(0, part.n_samples, max(1, -(-part.n_samples // _BINS)))
@@ -79,7 +84,7 @@ def _waterfall(
     length = int(min(n, max(64, min(2 * n // (_COLUMNS + 1), _LONGEST_S * rate_hz))))
     hops = np.arange(0, n - length + 1, max(1, length // 2))
     hz = np.fft.rfftfreq(length, 1.0 / rate_hz)
-    first, last = int(np.searchsorted(hz, band[0])), int(np.searchsorted(hz, band[1], side="right"))
+    first, last = min(int(np.searchsorted(hz, band[0])), hz.size - 2), int(np.searchsorted(hz, band[1], side="right"))
     edges = np.unique(np.linspace(max(1, first), max(last, first + 2), _ROWS + 1).astype(int))[:-1]
     shape = window(length, weights)
     columns, at, speeds = list[Array](), list[float](), list[float]()
