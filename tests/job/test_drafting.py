@@ -124,3 +124,11 @@ def test_where_neither_names_nor_the_record_show_roles_none_is_put_into_the_ques
         AmbidError, match=r"which column is what; there are column 2 -.*column 4 .*'position': 'NAME \[m\]'"
     ):
         draft(tmp_path / "bare.txt")
+
+
+@pytest.mark.parametrize("name", ["volt\x07age", "v" * 300])
+def test_a_name_that_no_rig_can_hold_is_refused(tmp_path, name):
+    path = tmp_path / "r.csv"
+    path.write_text(f"time [s],{name} [V],i [A]\n" + "".join(f"{k / 1000},{k},{-k}\n" for k in range(99)))
+    with pytest.raises(AmbidError, match="no rig can name it"):
+        draft(path, coil=True)

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 _USUAL = {"voltage": 3.0, "current": 0.3, "position": 1e-4}  # standard deviations, SI, of which a thousandth is far
 _KNOWN = 0.5  # largest relative standard deviation of a parameter whose size counts
+_LONGEST_NAME = 200
+_CONTROL = {*map(chr, range(32)), "\x7f"}
 _LOOKED = 20_000  # samples that a trial fit takes
 _LIKELY = {
     "voltage": ("V", "mV"),
@@ -85,6 +87,12 @@ def draft(
         )
     record, variables = _read(source, told, rate_hz, gaps, dict(layout or {}))
     told = {role: (role, unit) for role, (_, unit) in told.items()} if variables else told
+    strange = next((x for x in record.names if _CONTROL & set(x) or len(x) > _LONGEST_NAME), None)
+    if strange is not None:
+        raise RecordError(
+            f"column {strange[:40]!r}: no rig can name it, as a name has up to {_LONGEST_NAME} printable characters. "
+            "Rename it"
+        )
     reading: dict[str, object] = {} if rate_hz is None else {"rate_hz": rate_hz}
     reading |= {"gaps": gaps} if gaps != "error" else {}
     if len(axes_of(record)) > 1 and not told:
