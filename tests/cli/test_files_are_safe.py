@@ -137,3 +137,15 @@ def test_force_writes_over_it(made, ambid, monkeypatch):
     done = ambid(*RECORD, "m.csv", "--force")
     assert done.code == 0
     assert "m.csv is replaced" in done.err
+
+
+def test_what_stands_where_notes_would_is_kept(ambid, tmp_path):
+    beside, out = tmp_path / "r.csv-metadata.json", tmp_path / "r.csv"
+    beside.write_text('{"tableSchema": "mine"}', encoding="utf-8")
+    words = ("simulate", "thesis", "--duration", "0.1", "-o", str(out))
+    found = ambid(*words)
+    assert (found.code, beside.read_text(encoding="utf-8")) == (2, '{"tableSchema": "mine"}')
+    assert "would hold the notes of r.csv" in found.err
+    assert not out.exists()
+    beside.unlink()
+    assert [ambid(*words).code for _ in range(2)] == [0, 0]  # notes of its own are replaced

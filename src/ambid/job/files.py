@@ -103,8 +103,14 @@ class Files:
     def stage_notes(self, path: Path, comments: Sequence[str]) -> None:
         """Write what is to be said of a CSV file that is staged, into the file beside it."""
         if comments:
-            from ambid.record.csv_format import notes_path, notes_text
+            from ambid.record.csv_format import notes_in, notes_path, notes_text
 
+            beside = notes_path(path)
+            if beside.exists() and not notes_in(beside):
+                raise AmbidError(
+                    f"{beside} would hold the notes of {path.name}, and is another file. Move it, or choose another "
+                    "name"
+                )
             data = self._staged[path.resolve()].read_bytes()
             self.stage_text(notes_path(path), notes_text(path.name, data, comments))
 
