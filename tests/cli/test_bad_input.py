@@ -339,3 +339,10 @@ def test_the_record_itself_is_sound(bench, ambid):
     found = ambid("identify", "record.csv", "--rig", "rig.toml", "--strict")
     assert found.code == 0, found.err + found.out
     assert found.err == ""
+
+
+def test_the_name_of_a_file_does_not_break_the_line(ambid):
+    found = ambid("info", "no\nsuch\x1b[31m.csv")
+    assert found.code == 2
+    assert r"no such\x1b[31m.csv" in found.err
+    assert found.err.count("\n") == 1

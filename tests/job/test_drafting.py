@@ -132,3 +132,11 @@ def test_a_name_that_no_rig_can_hold_is_refused(tmp_path, name):
     path.write_text(f"time [s],{name} [V],i [A]\n" + "".join(f"{k / 1000},{k},{-k}\n" for k in range(99)))
     with pytest.raises(AmbidError, match="no rig can name it"):
         draft(path, coil=True)
+
+
+@pytest.mark.parametrize("name", ["a\nmodel = 3 #.csv", "a\x1b[31m.csv", "a\udcff.csv"])
+def test_the_name_of_a_file_does_not_write_the_rig(tmp_path, record, name):
+    FILES["closed_loop.csv"](tmp_path / "plain.csv", record)
+    (tmp_path / "plain.csv").rename(tmp_path / name)
+    (tmp_path / "rig.toml").write_text(draft(tmp_path / name).text, encoding="utf-8")
+    assert load_rig(tmp_path / "rig.toml").plant.name == "one-axis"

@@ -6,6 +6,7 @@ import errno
 import gc
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -141,7 +142,8 @@ class _ClosedOutput(io.TextIOBase):
 
 
 def _refuse(line: str, code: int, *, trace: bool) -> int:
-    """Print one line on standard error, after the traceback if it is wanted."""
+    """Print one line on standard error, after the traceback if it is wanted; what would end it is shown by its code."""
+    line = re.sub(r"[\x00-\x1f\x7f-\x9f]", lambda x: repr(x[0])[1:-1], line)
     if trace:
         import traceback
 

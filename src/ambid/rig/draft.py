@@ -75,7 +75,7 @@ def draft_rig(
         return _draft_rotor(record, axes, reading or {})
     ranked = rank_roles(record) if ranked is None else ranked
     plant, resting = model(model_of(ranked, coil=coil)), not coil and at_rest(ranked)
-    name = record.provenance.get("file", "a record")
+    name = _source_name(record)
     lines = [
         f"# Guessed from {name}: check every line marked CHECK, then run: "
         f"{command('identify', name, rig='<this file>')}",
@@ -117,6 +117,11 @@ def model_of(ranked: Mapping[str, Sequence[Candidate]], *, coil: bool = False) -
     return "coil" if coil or at_rest(ranked) else "one-axis"
 
 
+def _source_name(record: Record) -> str:
+    """Return the name of a record's file as a comment may hold it: a line break in it would end the comment."""
+    return "".join(x if x.isprintable() else "?" for x in record.provenance.get("file", "a record"))
+
+
 def _clock_words(record: Record) -> str:
     """Say what was taken as time, and why."""
     settings = record.history[0].settings if record.history else {}
@@ -143,7 +148,7 @@ def axes_of(record: Record) -> list[str]:
 
 def _draft_rotor(record: Record, axes: Sequence[str], reading: Mapping[str, object]) -> str:
     """Guess the rig of a rotor on many axes: two axes a bearing; without its planes, to be measured, it is refused."""
-    name = record.provenance.get("file", "a record")
+    name = _source_name(record)
     lines = [
         f"# Guessed from {name}: complete every line marked CHECK, then run: "
         f"{command('identify', name, rig='<this file>')}",
