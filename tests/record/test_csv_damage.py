@@ -5,6 +5,7 @@ import os
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ambid.errors import RecordError
@@ -200,10 +201,29 @@ def test_a_hundred_thousand_columns_are_refused_at_once(tmp_path, head):
     assert time.perf_counter() - began < 20.0
 
 
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "r.csv")
+@pytest.mark.parametrize("name", ["r.csv", "r.csv.gz", "r.mat", "r.npz", "r.h5"])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name):
+    os.mkfifo(tmp_path / name)
     with pytest.raises(RecordError, match="a device or a pipe"):
-        read_record(tmp_path / "r.csv")
+        read_record(tmp_path / name)
+
+
+def test_arrays_under_a_password_are_refused(tmp_path):
+    np.savez(tmp_path / "r.npz", time=np.zeros(99))
+    data = (tmp_path / "r.npz").read_bytes()
+    for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        where = data.index(mark) + at
+        data = data[:where] + b"\x01" + data[where + 1 :]
+    (tmp_path / "r.npz").write_bytes(data)
+    with pytest.raises(RecordError, match="no sound file of NumPy arrays"):
+        read_record(tmp_path / "r.npz")
+
+
+def test_arrays_that_unpack_to_gigabytes_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("ambid.record.record._MOST_UNPACKED", 1000)
+    np.savez_compressed(tmp_path / "r.npz", time=np.zeros(1_000_000), u=np.zeros(1_000_000))
+    with pytest.raises(RecordError, match="unpacks to more than"):
+        read_record(tmp_path / "r.npz")
 
 
 @pytest.mark.parametrize(

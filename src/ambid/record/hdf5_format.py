@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ambid.errors import RecordError
-from ambid.record.record import Channel, Record, Step, file_bytes, sha256_of
+from ambid.record.record import Channel, Record, Step, file_bytes, refuse_pipe, sha256_of
 from ambid.record.streams import refuse_claim
 
 
@@ -190,6 +190,7 @@ def hdf5_of(path: Path) -> Iterator[Any]:
     def stored(name: str, node: Any) -> str | None:
         return name if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual) else None
 
+    refuse_pipe(path)
     with h5py.File(path, "r") as file:
         if name := file.id.links.visit(linked, info=True) or file.visititems(stored):
             shown = name if isinstance(name, str) else name.decode("utf-8", "replace")

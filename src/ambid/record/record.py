@@ -489,8 +489,7 @@ def readable(path: Path, error: type[AmbidError] = RecordError, what: str = "rec
     if INSIDE and not any(path.resolve().is_relative_to(folder.resolve()) for folder in INSIDE):
         raise error(f"{what} {path} is outside of {INSIDE[0]}. Copy it into that folder")
     try:
-        if not path.is_file() and path.exists() and not path.is_dir():  # opening a pipe would wait for its writer
-            raise error(f"{what} {path} is a device or a pipe; it must be a file. Write what it gives into one")
+        refuse_pipe(path, error, what)
         with path.open("rb") as file:
             yield file
     except FileNotFoundError:
@@ -503,6 +502,12 @@ def readable(path: Path, error: type[AmbidError] = RecordError, what: str = "rec
         raise error(
             f"{what} {path} cannot be read: {failure.strerror or failure}. Check the path and the disk"
         ) from None
+
+
+def refuse_pipe(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> None:
+    """Refuse what has no end, or waits for a writer when it is opened; arguments as `file_bytes`."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise error(f"{what} {path} is a device or a pipe; it must be a file. Write what it gives into one")
 
 
 def _similar(path: Path) -> str:
@@ -551,7 +556,7 @@ def sha256_of(data: bytes) -> str:
 
 def gunzipped(data: bytes, path: Path) -> bytes:
     """Return what the bytes of a gzip file hold; `path` is for messages."""
-    most = max(_MOST_UNPACKED, 200 * len(data))
+    most = most_unpacked(data)
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             text = file.read(most + 1)
@@ -559,12 +564,22 @@ def gunzipped(data: bytes, path: Path) -> bytes:
         raise RecordError(f"record {path} is a truncated gzip file: its end is missing. Copy it again") from None
     except (gzip.BadGzipFile, zlib.error) as failure:
         raise RecordError(f"record {path} is not a valid gzip file ({failure}). Copy it again, or rename it") from None
-    if len(text) > most:
+    refuse_bomb(len(text), data, path)
+    return text
+
+
+def most_unpacked(data: bytes) -> int:
+    """Return the bytes that a packed record may hold."""
+    return max(_MOST_UNPACKED, 200 * len(data))
+
+
+def refuse_bomb(size: int, data: bytes, path: Path) -> None:
+    """Refuse a packed record of which `size` bytes are known to come."""
+    if size > (most := most_unpacked(data)):
         raise RecordError(
             f"record {path} unpacks to more than {most >> 20} MiB, over 200 times its size: that is no record. Check "
             "where it comes from"
         )
-    return text
 
 
 def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> str:
