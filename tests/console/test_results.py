@@ -209,3 +209,11 @@ def test_a_record_is_read_with_a_rate_and_gaps_which_its_rig_keeps(folder):
     rig = rig_from_text(shown["draft"], folder / "draft.toml")
     assert (rig.record.rate_hz, rig.record.gaps) == (5000.0, "interpolate")
     assert np.allclose(np.diff(shown["t"])[0] * 5000.0 % 1.0, 0.0, atol=1e-6)
+
+
+def test_a_result_that_was_edited_is_refused_in_words(folder):
+    document = json.loads((folder / "known.json").read_text(encoding="utf-8"))
+    (folder / "edited.json").write_text(json.dumps({**document, "validation": {"x": [1]}}), encoding="utf-8")
+    (end,) = told(until(Runs(folder).start({"job": "result", "estimate": "edited.json"})), "end")
+    assert end["how"] == "refused"
+    assert "edited.json is not a complete result (KeyError: 'samples')" in end["why"]

@@ -288,11 +288,14 @@ def _preview(worker: Worker) -> None:
 
 
 def _result(worker: Worker) -> None:
+    from ambid.estimation.estimate import read_whole
     from ambid.job.presentation import content
     from ambid.job.results import load
 
     path = worker.named("estimate")
-    worker.feed.tell("result", {"name": path.stem, "content": content(load(path))}, sticky="result")
+    found = load(path)
+    shown = read_whole(lambda: content(found), path.name, "result", "identify")  # entries of other readers among it
+    worker.feed.tell("result", {"name": path.stem, "content": shown}, sticky="result")
 
 
 def _look(worker: Worker) -> None:
