@@ -140,3 +140,10 @@ def test_the_name_of_a_file_does_not_write_the_rig(tmp_path, record, name):
     (tmp_path / "plain.csv").rename(tmp_path / name)
     (tmp_path / "rig.toml").write_text(draft(tmp_path / name).text, encoding="utf-8")
     assert load_rig(tmp_path / "rig.toml").plant.name == "one-axis"
+
+
+def test_counts_without_a_unit_are_not_taken_for_one(tmp_path, record):
+    x = {"voltage": record.u * 100, "current": record.i * 1e4, "position": record.x * 1e8}
+    np.savez(tmp_path / "r.npz", fs=record.rate, **{k: np.rint(v).astype("i4") for k, v in x.items()})
+    with pytest.raises(AmbidError, match="'voltage' has no unit and holds whole numbers, which may be counts"):
+        draft(tmp_path / "r.npz")

@@ -255,6 +255,14 @@ def _unit_question(
         return ""  # what is in another unit needs a gain or a table
     if not (bare or trial):
         return ""
+    counts = next((r for r in bare if np.array_equal(chosen[r].values, np.rint(chosen[r].values))), None)
+    if counts is not None:  # of a converter, whose scale only a rig knows: by luck they have the sizes of a bearing
+        c = chosen[counts]
+        return (
+            f"column {c.name!r} has no unit and holds whole numbers, which may be counts. Say its unit: "
+            f"{setting('column', f'{counts}={c.name} [{ROLES[counts]}]')}, and give channels.{counts}.gain in the rig "
+            "where they are"
+        )
     columns = {role: _in_si(c, units.get(role)) for role, c in chosen.items()}
     found = _trial(record, columns, plant)
     if bare:
