@@ -210,3 +210,9 @@ def test_a_slip_in_the_drawing_is_named(old: str, new: str, says: str) -> None:
 def test_a_drawing_without_bearings_is_refused() -> None:
     with pytest.raises(RigError, match="shaft is given, but no"):
         rig_from_text('schema = "ambid.rig/1"\nmodel = "one-axis"\n' + SHAFT, "bench.toml")
+
+
+@pytest.mark.parametrize("speed", ["1e308", "-1e9"])
+def test_a_speed_that_no_rotor_has_is_refused(speed: str) -> None:
+    with pytest.raises(RigError, match="no rotor is faster than"):
+        rig_from_text(TEXT.replace("value = 3000,", f"value = {speed},"), "bench.toml")

@@ -36,6 +36,7 @@ _DRIVES: tuple[Drive, ...] = ("voltage", "current", "command")
 TURN = 2.0 * math.pi
 _SPEEDS = {"rad/s": 1.0, "Hz": TURN}
 """SI units in which a speed may be given, and what makes rad/s of them."""
+_FASTEST = 1e6  # rad/s, ten million turns a minute
 _DISC = {"m": "kg", "Id": "kg m^2", "Ip": "kg m^2", "outer": "m", "inner": "m", "width": "m", "rho": "kg/m^3"}
 
 
@@ -211,7 +212,10 @@ def speed_of(entry: QuantityEntry | None, where: str) -> float:
     unit = unit_of(entry.unit, f"{where}: speed")
     if unit.si not in _SPEEDS:
         raise RigError(f"{where}: speed is in [{entry.unit}]; it is measured in [rpm], [rad/s] or [Hz]. Correct unit")
-    return unit.to_si(entry.value) * _SPEEDS[unit.si]
+    speed = unit.to_si(entry.value) * _SPEEDS[unit.si]
+    if not abs(speed) <= _FASTEST:
+        raise RigError(f"{where}: speed is {speed:.4g} rad/s; no rotor is faster than {_FASTEST:g} rad/s. Correct it")
+    return speed
 
 
 def shaft_of(entry: ShaftEntry, parameters: Sequence[Parameter], where: str) -> Shaft:
