@@ -8,6 +8,7 @@ import pytest
 from ambid.errors import AmbidError
 from ambid.job import drafting, identify, info
 from ambid.job.drafting import draft
+from ambid.record import read_record
 from ambid.rig import load_rig
 from tests.job.foreign_files import FILES, QUESTIONS, signals
 from tests.tiers import ALL
@@ -147,3 +148,17 @@ def test_counts_without_a_unit_are_not_taken_for_one(tmp_path, record):
     np.savez(tmp_path / "r.npz", fs=record.rate, **{k: np.rint(v).astype("i4") for k, v in x.items()})
     with pytest.raises(AmbidError, match="'voltage' has no unit and holds whole numbers, which may be counts"):
         draft(tmp_path / "r.npz")
+
+
+def test_a_hidden_sheet_is_not_read_before_one_that_is_shown(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl", reason="openpyxl, of ambid[formats], is not installed")
+    book = openpyxl.Workbook()
+    hidden = book.create_sheet("old")
+    hidden.sheet_state = "hidden"
+    for sheet, rows in ((book.active, 20), (hidden, 40)):
+        sheet.append(["time [s]", "voltage [V]"])
+        for k in range(rows):
+            sheet.append([k / 100, k])
+    book.save(tmp_path / "r.xlsx")
+    assert read_record(tmp_path / "r.xlsx").n_samples == 20
+    assert read_record(tmp_path / "r.xlsx", layout={"sheet": "old"}).n_samples == 40

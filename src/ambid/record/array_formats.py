@@ -77,7 +77,8 @@ def read_xlsx(
         with zipfile.ZipFile(io.BytesIO(data)) as packed:
             refuse_bomb(sum(x.file_size for x in packed.infolist()), data, path)
         book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-        sheets = {x.title: [_line(row) for row in x.iter_rows(values_only=True)] for x in book.worksheets}
+        shown = [x for x in book.worksheets if x.sheet_state == "visible" or x.title == layout.get("sheet")]
+        sheets = {x.title: [_line(row) for row in x.iter_rows(values_only=True)] for x in shown or book.worksheets}
     except RecordError:
         raise
     except Exception as failure:  # the parser raises whatever it meets in a damaged file
