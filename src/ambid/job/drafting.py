@@ -290,10 +290,10 @@ def _of_sizes(
         c = chosen[role]
         if not any(quantities(chosen[x].name) for x in bare):
             unknown = sorted(chosen.values(), key=attrgetter("name"))  # not by roles that nothing speaks for
-            listed = ", ".join(f"{x.name} {np.nanmin(x.values):.4g} … {np.nanmax(x.values):.4g}" for x in unknown)
+            ranges = ", ".join(f"{x.name} {np.nanmin(x.values):.4g} … {np.nanmax(x.values):.4g}" for x in unknown)
             asked = ", ".join(setting("column", f"{x}=NAME [{ROLES[x]}]") for x in chosen if x in bare)
             return (
-                f"neither name nor unit nor the record shows which column is what; there are {listed}. Say it: {asked}"
+                f"neither name nor unit nor the record shows which column is what; there are {ranges}. Say it: {asked}"
             )
         return (
             f"column {c.name!r} has no unit, and the record does not show which (its values reach "
