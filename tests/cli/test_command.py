@@ -138,7 +138,7 @@ def test_help_and_version(ambid):
         found = ambid(*words)
         assert (found.code, found.err) == (0, "")
         assert "Usage: ambid" in found.out
-    assert ambid("--version").out.startswith("ambid 0.")
+    assert ambid("--version").out.startswith("ambid 1.")
 
 
 LIGHT = """

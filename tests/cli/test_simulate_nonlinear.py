@@ -28,7 +28,7 @@ def test_preset_to_rig_to_records_to_numbers(tmp_path, monkeypatch, ambid, name,
         assert done.err == ""
         assert "truth: m " in done.out
         assert "L_leak " in done.out
-        assert "# truth: m " in (tmp_path / records[-1]).read_text(encoding="utf-8")
+        assert "truth: m " in (tmp_path / f"{records[-1]}-metadata.json").read_text(encoding="utf-8")
     found = ambid("identify", *records, "--rig", "bench.toml", "--nonlinear", "--json", "-")
     assert found.code == 0, found.err
     estimate, rig = json.loads(found.out), load_rig("bench.toml")

@@ -172,7 +172,7 @@ SOLID = {"job": "identify", "record": "rec.csv", "rig": "rig.toml", "out": "x"}
 @pytest.mark.parametrize(
     ("spec", "words"),
     [
-        ({"job": "preview", "record": "untimed.csv"}, "Add the column, or give Rate"),
+        ({"job": "preview", "record": "untimed.csv"}, "or give Rate"),
         ({"job": "preview", "record": "gap.csv"}, "give Gaps = interpolate or Gaps = cut"),
         ({**SOLID, "record": "gap.csv"}, "give gaps in [record] of the rig = interpolate"),
         ({**SOLID, "record": "untimed.csv"}, "give rate_hz in [record] of the rig"),
@@ -205,10 +205,11 @@ def test_a_record_is_read_with_a_rate_and_gaps_which_its_rig_keeps(folder):
     head = next(k for k, x in enumerate(lines) if x.startswith("time"))
     (folder / "untimed.csv").write_text("\n".join(x.partition(",")[2] for x in lines[head:]), encoding="utf-8")
     spec = {"job": "preview", "record": "untimed.csv", "rate_hz": 5000.0, "gaps": "interpolate"}
-    (shown,) = told(until(Runs(folder).start(spec)), "preview")
+    said = until(Runs(folder).start(spec))
+    (shown,), (seen,) = told(said, "preview"), told(said, "look")
     rig = rig_from_text(shown["draft"], folder / "draft.toml")
     assert (rig.record.rate_hz, rig.record.gaps) == (5000.0, "interpolate")
-    assert np.allclose(np.diff(shown["t"])[0] * 5000.0 % 1.0, 0.0, atol=1e-6)
+    assert np.allclose(np.diff(seen["t"])[0] * 5000.0 % 1.0, 0.0, atol=1e-6)
 
 
 def test_a_result_that_was_edited_is_refused_in_words(folder):

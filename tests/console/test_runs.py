@@ -50,7 +50,7 @@ def test_a_feed_is_read_as_it_was_written_and_old_parts_go(tmp_path):
 def test_a_page_that_comes_late_is_told_what_went_before(tmp_path):
     track = track_of(seconds=12.0, every_s=0.05)
     feed = FeedWriter(tmp_path, part_bytes=100)  # each frame in a part of its own
-    lines = _Lines(SimpleNamespace(feed=feed, follow=lambda *, on: None, flags=[]))
+    lines = _Lines(SimpleNamespace(feed=feed, follow=lambda *, on: None, flags=[]), orders=True)
     lines.header(track.header)
     for line in track.lines:
         lines.line(line)

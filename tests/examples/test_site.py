@@ -28,7 +28,7 @@ def test_the_navigation_reaches_every_page_once():
     assert sorted(entries) == sorted(set(entries))
     pages = {path.stem for path in DOCS.glob("*.md")} - {"index"}
     notebooks = {f"made/notebooks/{path.stem}" for path in (DOCS / "notebooks").glob("*.py")}
-    made = {"made/gallery/index", "made/reference/commands", "made/reference/python"}
+    made = {"made/gallery/index", *(f"made/reference/{name}" for name in ("commands", "options", "python"))}
     assert set(entries) == pages | notebooks | made
 
 

@@ -43,8 +43,8 @@ def said(run=RUN, quality=QUALITY, counters=NOTHING, not_stored=0):
 def test_a_whole_record_is_told_with_its_columns():
     text = said()
     assert text.startswith("verdict: usable o.h5: 1000 samples at 2000 Hz (0.5 s) from serial /dev/ttyX")
-    assert "gap 512 20 4 13.5 dB 20 % 0 %" in text
-    assert "duty 512 20 - - 20 % 0 %" in text
+    assert "gap [1] 512 20 4 13.5 dB 20 % 0 %" in text
+    assert "duty [1] 512 20 - - 20 % 0 %" in text
     assert "what does not repeat with the excitation" in text
 
 

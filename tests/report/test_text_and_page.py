@@ -124,7 +124,7 @@ def test_the_report_holds_everything_and_needs_nothing_else(page, judged):
         assert f"<th>{p.name}</th>" in page
     for name in judged.estimate.checks:
         assert name in page
-    for words in ("ambid 0.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):
+    for words in ("ambid 1.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):
         assert words in page
 
 

@@ -63,7 +63,7 @@ def test_what_cannot_be_one_machine_is_refused(apart: tuple[Any, Record, Record]
         ({"record": [turning, turning]}, "count twice"),
         ({"record": [still]}, "no column 'angle'"),
         ({"record": [still, turning], "speed_rpm": 0.0}, "2 records and 1 speed"),
-        ({"record": still, "speed_rpm": [float("nan")]}, "must be a speed in rpm"),
+        ({"record": still, "speed_rpm": [float("nan")]}, "speed_rpm is nan; it must be a number"),
         ({"record": [still, replace(turning, rate_hz=5000.0)]}, "5000 Hz"),
     ]
     for words, said in refused:

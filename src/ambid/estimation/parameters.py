@@ -140,8 +140,9 @@ class Parametric:
 
     def __post_init__(self) -> None:
         """Name rows and columns of the covariance."""
-        matrix: Any = getattr(self, "covariance", None)
-        names: Any = getattr(self, "covariance_names", None) or getattr(getattr(self, "model", None), "names", ())
+        own = {n: getattr(self, n) for n in ("covariance", "covariance_names", "model") if hasattr(type(self), n)}
+        matrix: Any = own.get("covariance")
+        names: Any = own.get("covariance_names") or getattr(own.get("model"), "names", ())
         if matrix is not None and np.shape(matrix) == (len(names), len(names)):
             object.__setattr__(self, "covariance", Labelled.of(matrix, tuple(names)))
 

@@ -36,7 +36,6 @@ _NAMED_NUMBER = re.compile(
     rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d*[.,]?\d+{_POWER})\s*[,;\t]?\s*"
     r"(?P<unit>[A-Za-zµμ]{0,3})"
 )
-_EITHER = re.compile(r"[1-9]\d{0,2}[.,]\d{3}")  # with a decimal mark or a thousands separator: nobody knows
 _HEAD = 1 << 14  # bytes in which the words of an encoding are looked for
 _FASTEST = 2e6  # Hz, of a bearing
 _MOST_COLUMNS = 4096
@@ -345,7 +344,7 @@ def _beside(lines: Sequence[str]) -> dict[str, tuple[float, str | None]]:
     pairs: dict[str, tuple[float, str | None]] = {}
     for line in lines:
         match = _NAMED_NUMBER.fullmatch(line.lstrip("#%").strip().rstrip(",;\t "))
-        if match and not (_thousandfold(**match.groupdict()) or _EITHER.fullmatch(match["number"])):
+        if match and not _thousandfold(**match.groupdict()):
             pairs[match["name"].strip()] = (float(match["number"].replace(",", ".")), match["unit"] or None)
     return pairs
 

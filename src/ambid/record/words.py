@@ -143,4 +143,4 @@ def rate_of(name: str, value: float, text: str | None = None) -> tuple[float, bo
     else:
         return None
     sure = unit is not None or key == "samplespersecond"
-    return (float(f"{rate:.10g}"), sure) if 50.0 < rate <= 1e8 else None  # below, no bearing is sampled
+    return (float(f"{rate:.10g}"), sure) if 20.0 <= rate <= 1e8 else None
