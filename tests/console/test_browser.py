@@ -130,7 +130,7 @@ def test_a_record_without_time_is_read_with_a_rate(page, folder):
     head = next(k for k, x in enumerate(lines) if x.startswith("time"))
     (folder / "untimed.csv").write_text("\n".join(x.partition(",")[2] for x in lines[head:]), encoding="utf-8")
     page.click(page.with_text("#list tr", "untimed.csv"))
-    page.with_text("#detail .refused", "Add the column, or give Rate", LONG_S)
+    page.with_text("#detail .refused", "or give Rate", LONG_S)
     page.put("#detail input[type=number]", "5000")
     page.click(page.with_text("#detail button", "Read again"))
     page.with_text("#detail button", "Identify", LONG_S)
