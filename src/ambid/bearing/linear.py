@@ -292,15 +292,16 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
 def _better_delay(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
     """The fit at another whole delay, if one is better: under feedback the likelihood has minima far apart."""
     others = [d for d in range(max(MAX_DELAY, fit.problem.delay + 1) + 1) if d != fit.problem.delay]
-    trials = [_at_delay(fit, d, tick, steps=_LOOK) for d in others]
+    trials = [_at_delay(fit, d, tick) for d in others]
     nearest = min(trials, key=_per_sample)
     other = search(nearest.problem, nearest.vector, tick=tick, work=nearest.work)
     return other if _per_sample(other) < _per_sample(fit) else None
 
 
-def _at_delay(fit: Fit, delay: int, tick: Callable[[], None] | None, *, steps: int) -> Fit:
+def _at_delay(fit: Fit, delay: int, tick: Callable[[], None] | None) -> Fit:
+    """A short search at another whole delay, from the numbers of a fit."""
     problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
-    return search(problem, carry(fit, problem), steps=steps, tick=tick, work=workspace_near(fit, problem))
+    return search(problem, carry(fit, problem), steps=_LOOK, tick=tick, work=workspace_near(fit, problem))
 
 
 def _per_sample(fit: Fit) -> float:

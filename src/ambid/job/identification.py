@@ -243,11 +243,13 @@ def identify_axis(
 
 def _with_facts(refusal: str, bench: Record, rig: Rig) -> str:
     """Put what the means say before a refusal, whose guess may be wrong then."""
-    from ambid.validation.facts import facts
+    from ambid.validation.facts import means_check
 
+    if not {"voltage", "current"} <= set(bench.names):
+        return refusal
     with np.errstate(all="ignore"):  # of values that no sensor shows
-        means = facts(bench, rig).get("ohm")
-    return refusal if means is None or means.passed else f"{means.detail}. Further: {refusal}"
+        means = means_check(bench, rig)
+    return refusal if means.passed else f"{means.detail}. Further: {refusal}"
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:

@@ -18,6 +18,7 @@ from ambid.record.frames import imported
 from ambid.record.mat_format import content_of_hdf5, read_content
 from ambid.record.record import Record, file_bytes, provenance_of, refuse_bomb
 from ambid.record.sampling import GapPolicy, check_gap_policy, uniform_record
+from ambid.record.streams import one_line
 
 
 def read_numpy(
@@ -73,19 +74,12 @@ def read_xlsx(
     check_gap_policy(gaps)
     data = file_bytes(path)
     openpyxl = imported("openpyxl", "an Excel workbook", "formats")
-    try:
+    with one_line(path, "no sound Excel workbook", "Save it again"):
         with zipfile.ZipFile(io.BytesIO(data)) as packed:
             refuse_bomb(sum(x.file_size for x in packed.infolist()), data, path)
         book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
         shown = [x for x in book.worksheets if x.sheet_state == "visible" or x.title == layout.get("sheet")]
         sheets = {x.title: [_line(row) for row in x.iter_rows(values_only=True)] for x in shown or book.worksheets}
-    except RecordError:
-        raise
-    except Exception as failure:  # the parser raises whatever it meets in a damaged file
-        detail = " ".join(str(failure).split())[:120]
-        raise RecordError(
-            f"record {path} is no sound Excel workbook ({type(failure).__name__}: {detail}). Save it again"
-        ) from None
     word = layout.get("sheet")
     if word is not None and word not in sheets:
         raise RecordError(f"record {path} has no sheet {word!r}; it has {choices(word, sheets)} Correct layout sheet")

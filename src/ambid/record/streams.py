@@ -55,15 +55,20 @@ def library(path: Path, what: str, magic: Sequence[bytes]) -> Iterator[str]:
             )
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
-    try:
+    with one_line(path, f"damaged, or no {what} file", "Copy or export it again"):
         yield digest
+
+
+@contextmanager
+def one_line(path: Path, what: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a parser raises about a damaged file into one line."""
+    try:
+        yield
     except RecordError:
         raise
-    except Exception as failure:  # the parsers raise whatever they meet in a damaged file
+    except Exception as failure:
         detail = " ".join(str(failure).split())[:120]
-        raise RecordError(
-            f"record {path} is damaged, or no {what} file ({type(failure).__name__}: {detail}). Copy or export it again"
-        ) from None
+        raise RecordError(f"record {path} is {what} ({type(failure).__name__}: {detail}). {remedy}") from None
 
 
 def chosen_group(path: Path, groups: Mapping[str, Sequence[str]], wanted: str | None) -> str:

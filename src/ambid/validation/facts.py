@@ -81,7 +81,7 @@ def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> d
     roles = set(record.names)
     checks: dict[str, Check] = {}
     if {"voltage", "current"} <= roles:
-        checks["ohm"] = _means(mean_resistance(record, rig))
+        checks["ohm"] = means_check(record, rig)
     if {"position", "current"} <= roles:
         known_pair = Check(passed=True, detail="position and current are of one run: the force shows")
         checks["belonging"] = known_pair if belongs else belonging(record)
@@ -92,7 +92,9 @@ def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> d
     return checks
 
 
-def _means(known: tuple[float, float] | None) -> Check:
+def means_check(record: Record, rig: Rig | None) -> Check:
+    """Check that mean voltage over mean current is none that a coil cannot have."""
+    known = mean_resistance(record, rig)
     if known is None:
         return Check(passed=True, detail="voltage and current have no mean that shows R")
     (value, sd), text = known, _ohms(*known)
