@@ -140,3 +140,23 @@ def test_what_is_no_start_of_a_rotor_is_refused():
             track_live(
                 device, RIG, excited(RIG, 8.0), start=ambid.identify(ambid.simulate("thesis", duration=0.3, seed=1))
             )
+
+
+def test_stop_ends_the_identification_of_a_start(monkeypatch):
+    stages, stop = [], []
+    identify = track_rotor.identify_rotor
+
+    def stopped_meanwhile(*records, tick):
+        def say(stage, done=None, /):
+            stages.append(stage)
+            if stage == "modes":
+                stop.append(True)
+            tick(stage, done)
+
+        return identify(*records, tick=say)
+
+    monkeypatch.setattr(track_rotor, "identify_rotor", stopped_meanwhile)
+    with open_device("simulated", RIG) as device, pytest.raises(DeviceError, match="stopped while"):
+        track_live(device, RIG, excited(RIG, 5.0), stopped=lambda: bool(stop))
+    assert "modes" in stages
+    assert "fit" not in stages

@@ -108,7 +108,12 @@ def track_live(
                 sought_s = 0.0 if known else min(course.seconds / 3.0, _SOUGHT_S)
                 source, how = lead.periodic(rig, sought_s), Following(**following)
                 frames = lead.frames(None, 0, lambda _: None)
-                track = follow_rotor(source, frames, rig, start, how, on_lag=on_lag, on_loop=on_loop)
+
+                def say(_: str, __: float | None = None, /) -> None:  # between steps of a start's identification
+                    if stopped():
+                        raise DeviceError("the run was stopped while its start was identified: nothing was tracked")
+
+                track = follow_rotor(source, frames, rig, start, how, on_lag=on_lag, on_loop=on_loop, say=say)
             else:
                 assert not isinstance(start, RotorEstimate)
                 source = lead.source

@@ -101,10 +101,11 @@ def follow_rotor(
     *,
     on_lag: Callable[[float], object],
     on_loop: Callable[[float, Mapping[str, Any]], object],
+    say: Tick,
 ) -> Track:
-    """Follow a rotor in a stream from its first periods on, which identify a start unless there is one. `on_loop`: told
-    the time and the sensitivity of each axis, as an estimate has it: measured in the run, without an excitation
-    predicted by the start.
+    """Follow a rotor in a stream from its first periods on, which identify a start unless there is one; `say` may end
+    that. `on_loop`: told the time and the sensitivity of each axis, as an estimate has it: measured in the run, without
+    an excitation predicted by the start.
     """
     bench, model, identified = lead.record, rig.rotor, start is None or isinstance(start, (int, float))
     assert model is not None
@@ -121,7 +122,7 @@ def follow_rotor(
     excitation = replace(excitation, first=excitation.first - excitation.first % period)  # the rest is of the next one
     first = excitation.first + n * period
     if identified:
-        estimate = identify_rotor([_periods(bench, excitation, 0, n)], rig)
+        estimate = identify_rotor([_periods(bench, excitation, 0, n)], rig, tick=say)
     else:
         estimate = _given(start, rig, bench.rate_hz, still.speed)
     every = Experiment(spectra=period_spectra(still.record, model, excitation, still.speed), speed=still.speed)
