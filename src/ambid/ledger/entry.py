@@ -21,9 +21,32 @@ from ambid.rig import Rig, rig_text
 from ambid.settings.caller import setting
 
 SCHEMA = "ambid.ledger/1"
-VERSION = 1
-STEPS: Mapping[int, tuple[str, ...]] = {}
-"""Statements that bring a ledger of a version to the next one."""
+VERSION = 2
+STEPS: Mapping[int, tuple[str, ...]] = {
+    1: (
+        """CREATE TABLE correction (
+            id {serial} NOT NULL PRIMARY KEY, at {double} NOT NULL, who TEXT NOT NULL, kind TEXT NOT NULL,
+            bearing TEXT NOT NULL, text TEXT NOT NULL, why TEXT NOT NULL, old {blob} NOT NULL)""",
+        "CREATE INDEX correction_of ON correction (bearing, at)",
+        """CREATE TABLE assignment (
+            sha TEXT NOT NULL, name TEXT NOT NULL, bearing TEXT NOT NULL, taken_at {double},
+            PRIMARY KEY (sha, name))""",
+        """CREATE TABLE claim (
+            key TEXT NOT NULL PRIMARY KEY, record TEXT NOT NULL, owner TEXT NOT NULL, begun_at {double} NOT NULL,
+            heartbeat_at {double} NOT NULL, tries INTEGER NOT NULL)""",
+        """CREATE TABLE silence (
+            id {serial} NOT NULL PRIMARY KEY, at {double} NOT NULL, kind TEXT NOT NULL, bearing TEXT NOT NULL,
+            rule TEXT NOT NULL, parameter TEXT NOT NULL, since {double}, until {double}, who TEXT NOT NULL,
+            why TEXT NOT NULL)""",
+        "CREATE INDEX silence_of ON silence (bearing, at)",
+    )
+}
+"""Statements that bring a ledger of a version to the next one, as SQL of then: today's tables may differ."""
+KINDS: Mapping[str, Mapping[str, str]] = {
+    "sqlite": {"serial": "INTEGER", "double": "DOUBLE", "blob": "BLOB"},
+    "postgresql": {"serial": "SERIAL", "double": "DOUBLE PRECISION", "blob": "BYTEA"},
+}
+"""What the kinds of `STEPS` are called, by engine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -307,5 +330,24 @@ def tables() -> Any:
         "failure", whole, column("key", primary_key=True),
         *(column(name) for name in ("bearing", "record", "sha", "rig_sha", "settings", "version", "reason")),
         column("failed_at", Double),
+    )  # fmt: skip
+    Table(  # `old`: JSON, zlib: bearing and time of each estimate before, by key
+        "correction", whole, column("id", Integer, primary_key=True), column("at", Double),
+        *(column(name) for name in ("who", "kind", "bearing", "text", "why")), column("old", LargeBinary),
+        Index("correction_of", "bearing", "at"),
+    )  # fmt: skip
+    Table(  # what a correction said of a record: stored under `name` it is of `bearing`, and of that time, if any
+        "assignment", whole, column("sha", primary_key=True), column("name", primary_key=True), column("bearing"),
+        column("taken_at", Double, nullable=True),
+    )  # fmt: skip
+    Table(  # records that a fleet has at work; `key`: as that of the estimate to come
+        "claim", whole, column("key", primary_key=True), column("record"), column("owner"),
+        column("begun_at", Double), column("heartbeat_at", Double), column("tries", Integer),
+    )  # fmt: skip
+    Table(  # alarms acknowledged or silenced; `since`: when the alarm was raised, none: any of this rule
+        "silence", whole, column("id", Integer, primary_key=True), column("at", Double),
+        *(column(name) for name in ("kind", "bearing", "rule", "parameter")),
+        column("since", Double, nullable=True), column("until", Double, nullable=True), column("who"), column("why"),
+        Index("silence_of", "bearing", "at"),
     )  # fmt: skip
     return whole

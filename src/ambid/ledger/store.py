@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -550,13 +551,21 @@ def _make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
             raise AmbidError(f"ledger {ledger} holds no ledger yet. Check the URL")
         if not there:
             whole.create_all(c)
-            c.execute(insert(meta), [{"name": n, "value": v} for n, v in (("schema", entry.SCHEMA), ("version", "1"))])
-            c.execute(update(meta).where(meta.c.name == "version").values(value=str(entry.VERSION)))
+            facts = {"schema": entry.SCHEMA, "version": str(entry.VERSION)}
+            c.execute(insert(meta), [{"name": n, "value": v} for n, v in facts.items()])
             return
         if "meta" not in there:
             raise AmbidError(f"{ledger} is not a ledger of ambid: it has other tables of the same names. Give another")
         facts = {row.name: row.value for row in c.execute(select(meta.c.name, meta.c.value))}
-        version = int(facts.get("version", "0"))
+        if facts.get("schema") != entry.SCHEMA:
+            raise AmbidError(f"{ledger} is not a ledger of ambid. Give another")
+        said = facts.get("version")
+        if re.fullmatch("[1-9][0-9]{0,8}", str(said), re.ASCII) is None:
+            what = "does not say its version" if said is None else f"says that its version is {said!r:.40}"
+            raise AmbidError(
+                f"ledger {ledger} {what}; it must be a number from 1 to {entry.VERSION}. Restore it from a backup"
+            )
+        version = int(str(said))
         if version > entry.VERSION:
             raise AmbidError(
                 f"ledger {ledger} is of version {version}; this ambid reads {entry.VERSION}. Install a newer one"
@@ -568,7 +577,7 @@ def _make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
             )
         for step in range(version, entry.VERSION):
             for statement in entry.STEPS[step]:
-                c.exec_driver_sql(statement)
+                c.exec_driver_sql(statement.format(**entry.KINDS[engine.dialect.name]))
         if version < entry.VERSION:
             c.execute(update(meta).where(meta.c.name == "version").values(value=str(entry.VERSION)))
 
