@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.ledger import open_ledger, store
+from ambid.ledger import open_ledger, opening, store
 from ambid.ledger.entry import Note, key_of, moment, settings_text
 from ambid.ledger.store import Failure
 from tests.ledger.entries import entry, parameter
@@ -254,7 +254,7 @@ def test_a_writer_waits_for_another(tmp_path, monkeypatch):
             writing.result(timeout=0.8)  # longer than one try
         other.execute("ROLLBACK")
         assert len(writing.result(timeout=60)) == 1
-    monkeypatch.setattr(store, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(opening, "PATIENCE_S", 0.1)
     other.execute("BEGIN IMMEDIATE")
     with pytest.raises(AmbidError, match="another program has been writing"):
         open_ledger(path)
@@ -263,7 +263,7 @@ def test_a_writer_waits_for_another(tmp_path, monkeypatch):
 
 KILLED = """
 import os, sys
-from ambid.ledger import open_ledger, store
+from ambid.ledger import open_ledger, opening, store
 from tests.ledger.entries import entry
 store._document = lambda *_: print("half", flush=True) or sys.stdin.read()
 with open_ledger(sys.argv[1]) as ledger:
