@@ -33,8 +33,13 @@ def test_the_same_record_rig_settings_and_version_is_kept_once(demo, ambid, monk
     tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start", "0.2")
     assert (tracked.code, "stored in" in tracked.err) == (0, True)
     with open_ledger("l.db", write=False) as ledger:
-        found = ledger.history("pump 1")
-    assert [e.job for e in found.estimates] == ["identify", "identify", "track"]
+        found, every = ledger.history("pump 1"), ledger.history("pump 1", every=True)
+    assert [e.job for e in found.estimates] == ["identify", "track"]
+    assert [(e.job, e.superseded) for e in every.estimates] == [
+        ("identify", True),
+        ("identify", False),
+        ("track", False),
+    ]
     shown = ambid("history", "pump 1", "--ledger", "l.db", "--plot", "h.png", "--json", "-")
     assert (shown.code, shown.out.startswith('{\n "schema": "ambid.history/1"')) == (0, True)
     assert (demo / "h.png").stat().st_size > 10_000

@@ -112,3 +112,37 @@ def test_a_slip_in_a_name_is_told(place):
         ambid.history("Q", ledger=place)
     with pytest.raises(AmbidError, match="Did you mean 'k_i'"):
         ambid.history("A", ledger=place)["ki"]
+
+
+def again(k, version, job="identify", **more):
+    """The estimate of a record by another version."""
+    return entry(k, version=version, job=job, settings=f'{{"job": "{job}"}}', **more)
+
+
+def test_of_a_record_and_job_the_estimate_of_the_newest_version_counts(tmp_path):
+    note = Note(at=BEGIN, kind="change", text="seen twice")
+    numbers = {v: (parameter("k_i", x, 0.5),) for v, x in (("1.10.0", 1.0), ("1.9.0", 2.0), ("1.10.0rc1", 3.0))}
+    with open_ledger(tmp_path / "l.db") as ledger:
+        for version in ("1.10.0", "1.9.0", "1.10.0rc1"):  # the newest first
+            ledger.add([again(k, version, parameters=numbers[version], events=(note,)) for k in range(3)])
+        ledger.add([again(1, "1.9.0", "track", parameters=(parameter("R", 4.0, 0.1),)), entry(5)])
+        found, every = ledger.history("A"), ledger.history("A", every=True)
+        (bearing,) = ledger.bearings()
+    assert [(e.sha, e.job, e.version) for e in found.estimates] == [
+        ("A0", "identify", "1.10.0"), ("A1", "identify", "1.10.0"), ("A1", "track", "1.9.0"),
+        ("A2", "identify", "1.10.0"), ("A5", "identify", "0.1.0"),
+    ]  # fmt: skip
+    assert (bearing.estimates, found.left_out, len(found.events)) == (5, 6, 3)
+    assert found["k_i"].value.tolist() == [1.0, 1.0, 1.0, 79.5]
+    assert [found.estimates[k].job for k in found["R"].estimate] == ["track", "identify"]
+    assert (len(every.estimates), every.left_out, every["k_i"].value.size) == (11, 0, 10)
+    assert sum(e.superseded for e in every.estimates) == 6
+    assert "6 estimates superseded (left out;" in str(found.summary())
+
+
+def test_of_several_by_one_version_the_latest_counts(tmp_path, monkeypatch):
+    with open_ledger(tmp_path / "l.db") as ledger:
+        for at, rig in ((30.0, "first"), (20.0, "second")):
+            monkeypatch.setattr("time.time", lambda at=at: at)
+            ledger.add([entry(0, rig=rig)])
+        assert [e.rig_sha for e in ledger.history("A").estimates] == ["first"]

@@ -38,11 +38,15 @@ def command(v: Values) -> None:
         rules = BUILT_IN if file is None else read_rules(file)
         if v.alarms is None:
             refuse_given(v.only("publish"), "{} needs --alarms. Give it, or omit {}")
+            if v.bearing is None and v.export is None:
+                refuse_given(v.only("every"), "{} is for one bearing, or for --tables. Name it, or omit {}")
+        else:
+            refuse_given(v.only("every"), "{} is not for --alarms. Omit {}")
         if v.bearing is None and v.alarms is None:
             refuse_given(v.only("json plot report strict"), "{} is for one bearing. Name it, or omit {}")
         with open_ledger(v.ledger, write=False) as found:
             if v.export is not None:
-                typer.echo(f"{v.export} holds {', '.join(found.export(v.export))}", err=True)
+                typer.echo(f"{v.export} holds {', '.join(found.export(v.export, every=v.every))}", err=True)
             result: Result
             if v.alarms is not None:
                 names = [b.name for b in found.bearings()] if v.bearing is None else [v.bearing]
@@ -55,6 +59,6 @@ def command(v: Values) -> None:
                 typer.echo(bearings_text(found.bearings(), found.failures().values(), paint=painter()))
                 return
             else:
-                result = found.history(v.bearing)
+                result = found.history(v.bearing, every=v.every)
         outputs.give(result)
     outputs.show(result, strict=v.strict)

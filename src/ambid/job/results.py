@@ -295,8 +295,10 @@ def rig_of(estimate: AnyEstimate | RotorEstimate, where: str) -> Rig:
         raise EstimationError(f"{where}: its rig cannot be used: {error}. Give {setting('rig')}") from None
 
 
-def history(bearing: str, *, ledger: str | Path) -> History:
+def history(bearing: str, *, ledger: str | Path, every: bool = False) -> History:
     """Return what is known of a bearing over time.
+
+    Of each record and job one estimate counts: that of the newest version of ambid, of several by it the latest.
 
     Parameters
     ----------
@@ -304,6 +306,8 @@ def history(bearing: str, *, ledger: str | Path) -> History:
         Its name; of a rotor the machine's.
     ledger : str or Path
         File of SQLite, or URL of PostgreSQL.
+    every : bool, optional
+        Also estimates that do not count.
 
     Returns
     -------
@@ -317,4 +321,4 @@ def history(bearing: str, *, ledger: str | Path) -> History:
     from ambid.ledger import open_ledger
 
     with open_ledger(ledger, write=False) as found:
-        return found.history(bearing)
+        return found.history(bearing, every=every)

@@ -49,6 +49,24 @@ KINDS: Mapping[str, Mapping[str, str]] = {
 """What the kinds of `STEPS` are called, by engine."""
 
 
+OWN = " "  # first letter of bearings of the ledger's own, which no name of a user's begins with
+REMOVED = f"{OWN}removed"
+ARCHIVED = f"{OWN}archived"  # whose values, events and documents are in another ledger
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A change of what a ledger holds; what was there before is kept, and undone by its number."""
+
+    number: int
+    at: float  # when it was made, s since 1970, UTC
+    who: str
+    kind: str  # "rename", "redate", "remove", "merge", "retain", "restore" or "undo"
+    bearing: str
+    text: str  # what changed
+    why: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Note:
     """Something that happened to a bearing."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice, pairwise, starmap, zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, choices, counted, nearest
 from ambid.estimation.result import Reason, Result
-from ambid.ledger.entry import Note, tables
+from ambid.ledger.entry import OWN, Correction, Note, tables
 from ambid.settings.caller import command
 
 if TYPE_CHECKING:
@@ -87,6 +88,10 @@ class KnownEstimate:
     status: str
     verdict: str  # "usable", "caution" or "unusable"
     failed: str  # names of the checks that speak against it, with commas
+    superseded: bool = False  # by one of the same record and job that counts; only where all were asked for
+
+
+_COLUMNS = KnownEstimate.__slots__[:-1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -105,6 +110,10 @@ class History(Result):
         By parameter.
     events : tuple of Note
         What happened, changes of the rig (kind ``rig``) included, in order of time.
+    left_out : int
+        Estimates of records of which another one of the same job counts: by a newer version, or later.
+    corrections : tuple of Correction
+        What was corrected, in order.
     """
 
     bearing: str
@@ -113,6 +122,8 @@ class History(Result):
     estimates: tuple[KnownEstimate, ...]
     series: Mapping[str, Series]
     events: tuple[Note, ...] = ()
+    left_out: int = 0
+    corrections: tuple[Correction, ...] = ()
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
@@ -139,29 +150,78 @@ class History(Result):
         return self.series[name]
 
 
-def history_of(c: Connection, bearing: str, ledger: str) -> History:
-    """Read the history of a bearing; `ledger`: name of the ledger."""
-    (known,) = _rows(c, ("SELECT id, name, plant FROM bearing WHERE name = ?", bearing))
-    if not known:
-        listing = command("history", ledger=ledger)
-        names = [name for rows in _rows(c, ("SELECT name FROM bearing ORDER BY name",)) for (name,) in rows]
-        raise AmbidError(f"ledger {ledger} has no bearing {bearing!r}.{nearest(bearing, names)} '{listing}' lists them")
-    ((of, name, plant),) = known
-    columns = ", ".join(KnownEstimate.__slots__)
-    heads, events, rows = _rows(
+def history_of(c: Connection, bearing: str, ledger: str, *, every: bool = False) -> History:
+    """Read the history of a bearing: of each record and job the estimate that counts, or `every` one.
+
+    `ledger`: name of the ledger.
+    """
+    of, name, plant = bearing_of(c, bearing, ledger)
+    heads, events, corrections, rows = _rows(
         c,
         (_HEADS, of),
-        ("SELECT at, kind, text, parameter FROM event WHERE bearing = ? ORDER BY at", of),
-        (f"SELECT {columns}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of),
+        ("SELECT at, kind, text, parameter, estimate FROM event WHERE bearing = ? ORDER BY at", of),
+        ("SELECT id, at, who, kind, bearing, text, why FROM correction WHERE bearing = ? ORDER BY at, id", name),
+        (f"SELECT {', '.join(_COLUMNS)}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of),
     )
-    estimates = tuple(starmap(KnownEstimate, (row[:-1] for row in rows)))
-    notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter in events]
+    estimates, ids = tuple(starmap(KnownEstimate, (row[:-1] for row in rows))), [row[-1] for row in rows]
+    series, left_out = _series(c, of, heads, ids, estimates), set[int]()
+    if len({(e.sha, e.job) for e in estimates}) < len(estimates):
+        left_out = superseded(c, of)
+        if every:
+            for number, e in zip(ids, estimates, strict=True):
+                e.superseded = number in left_out
+        else:
+            counts = np.array([number not in left_out for number in ids], dtype=bool)
+            estimates = tuple(e for e, counted_ in zip(estimates, counts, strict=True) if counted_)
+            series = {key: _of_those_that_count(s, counts) for key, s in series.items()}
+            events = [row for row in events if row[-1] not in left_out]
+    notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter, _ in events]
     notes += _rig_changes(c, estimates)
     return History(
-        bearing=name, plant=plant, ledger=ledger, estimates=estimates,
-        series=_series(c, of, heads, [row[-1] for row in rows], estimates),
-        events=tuple(sorted(notes, key=lambda x: x.at)),
+        bearing=name, plant=plant, ledger=ledger, estimates=estimates, series=series,
+        events=tuple(sorted(notes, key=lambda x: x.at)), left_out=0 if every else len(left_out),
+        corrections=tuple(starmap(Correction, corrections)),
     )  # fmt: skip
+
+
+def bearing_of(c: Connection, bearing: str, ledger: str) -> tuple[int, str, str]:
+    """Return number, name and rig's name of a bearing; refuse one that is not there."""
+    (known,) = _rows(c, ("SELECT id, name, plant FROM bearing WHERE name = ?", bearing))
+    if known and not bearing.startswith(OWN):
+        return known[0]
+    names = [name for rows in _rows(c, ("SELECT name FROM bearing ORDER BY name",)) for (name,) in rows]
+    near = nearest(bearing, [name for name in names if not name.startswith(OWN)])
+    listing = command("history", ledger=ledger)
+    raise AmbidError(f"ledger {ledger} has no bearing {bearing!r}.{near} '{listing}' lists them")
+
+
+def superseded(c: Connection, bearing: int | None = None) -> set[int]:
+    """Return the estimates, of a bearing or of all, that do not count: of one record and job that of the newest version
+    of ambid does, and of several by that version the latest.
+    """
+    where, values = ("", ()) if bearing is None else ("WHERE bearing = ?", (bearing,))
+    groups: dict[tuple[object, ...], list[tuple[tuple[Any, ...], float, int]]] = {}
+    query = f"""
+        SELECT e.id, e.bearing, e.sha, e.job, e.version, e.added_at FROM estimate AS e JOIN (
+            SELECT bearing, sha, job FROM estimate {where} GROUP BY bearing, sha, job HAVING count(*) > 1
+        ) AS d ON d.bearing = e.bearing AND d.sha = e.sha AND d.job = e.job"""
+    for rows in _rows(c, (query, *values)):
+        for number, of, sha, job, version, added_at in rows:
+            groups.setdefault((of, sha, job), []).append((_age(version), added_at, number))
+    return {number for group in groups.values() for _, _, number in sorted(group)[:-1]}
+
+
+def _age(version: str) -> tuple[tuple[int, ...], bool, str]:
+    """Return what puts versions in order: 1.10 is newer than 1.9, and 1.0 than 1.0rc1."""
+    numbers, rest = re.match(r"([0-9.]*)(.*)", version, re.DOTALL).groups()  # type: ignore[union-attr]
+    return tuple(int(x) for x in numbers.split(".") if x), not re.match(r"\W?(a|b|rc|dev)", rest), rest
+
+
+def _of_those_that_count(s: Series, counts: NDArray[np.bool_]) -> Series:
+    """Return a series without the estimates that do not count; `counts`: of all estimates, which do."""
+    own, place = counts[s.estimate], np.cumsum(counts) - 1
+    parts = {x: getattr(s, x)[own] for x in ("taken_at", "value", "sd", "identifiable")}
+    return replace(s, estimate=place[s.estimate[own]], **parts)
 
 
 def _rows(c: Connection, *questions: tuple[Any, ...]) -> Iterator[list[tuple[Any, ...]]]:

@@ -199,7 +199,7 @@ class Ledger:
             return {row.key: Failure(**{x: row[x] for x in row if x != "key"}) for row in _mappings(c, select(t))}
 
     def bearings(self) -> tuple[KnownBearing, ...]:
-        """Return the bearings of the ledger, by name.
+        """Return the bearings of the ledger, by name, with the number of estimates that count.
 
         Returns
         -------
@@ -211,21 +211,24 @@ class Ledger:
         b, e = t["bearing"].c, t["estimate"].c
         query = (
             select(
-                b.name, b.plant, func.count(e.id).label("estimates"), func.min(e.taken_at).label("first"),
-                func.max(e.taken_at).label("last"),
+                b.name, b.plant, func.count(func.distinct(e.sha + e.job)).label("estimates"),
+                func.min(e.taken_at).label("first"), func.max(e.taken_at).label("last"),
             )
+            .where(b.name.not_like(f"{entry.OWN}%"))
             .join_from(t["bearing"], t["estimate"]).group_by(b.id, b.name, b.plant).order_by(b.name)
         )  # fmt: skip
         with self._reading() as c:
             return tuple(KnownBearing(**row) for row in _mappings(c, query))
 
-    def history(self, bearing: str) -> History:
+    def history(self, bearing: str, *, every: bool = False) -> History:
         """Return what is known of one bearing over time.
 
         Parameters
         ----------
         bearing : str
             Its name.
+        every : bool, optional
+            Also estimates that another one of the same record and job supersedes.
 
         Returns
         -------
@@ -239,15 +242,19 @@ class Ledger:
         from ambid.ledger.history import history_of
 
         with self._reading() as c:
-            return history_of(c, bearing, self.shown)
+            return history_of(c, bearing, self.shown, every=every)
 
-    def export(self, folder: str | Path) -> tuple[str, ...]:
+    def export(self, folder: str | Path, *, every: bool = False) -> tuple[str, ...]:
         """Write the tables as Parquet files, for DuckDB or pandas; needs the extra ``ambid[formats]``.
+
+        Of each record and job stands there what counts in a history.
 
         Parameters
         ----------
         folder : str or Path
             Made where there is none; a table that is there is replaced only where this wrote it.
+        every : bool, optional
+            Also estimates that another one supersedes.
 
         Returns
         -------
@@ -262,7 +269,7 @@ class Ledger:
         from ambid.ledger.parquet import export
 
         with self._reading() as c:
-            return export(c, Path(folder))
+            return export(c, Path(folder), every=every)
 
     # --- inside -----------------------------------------------------------------------------------------------------
 

@@ -83,12 +83,20 @@ def history_sections(history: History) -> list[Section]:
         [(h.bearing, "strong"), f": {counted(n, 'estimate')}, {span}"],
         f"verdicts: {counts['usable']} usable, {counts['caution']} with caution, {counts['unusable']} not to be used",
     ]
+    older = h.left_out or sum(e.superseded for e in h.estimates)
+    if older:
+        shown = f"left out; {setting('every')} lists them" if h.left_out else "listed too"
+        head.append(f"{counted(older, 'estimate')} superseded ({shown}): of a record and job the newest version counts")
     rows: list[tuple[str, ...]] = [("", "latest value ± sd", "taken", "since the first", "known")]
     rows += [_row(s, n, _zone(h, s)) for s in h.measured.values()]
     events: list[Line] = []
     for e in h.events[-_SHOWN:]:
         parameter = f"{e.parameter}: " if e.parameter else ""
         events.append([f"{day(e.at)}  {e.kind}  ", parameter + e.text])
+    corrected: list[Line] = [
+        [f"{c.number}  {day(c.at)}  ", f"{c.text}, by {c.who}" + (f": {c.why}" if c.why else "")]
+        for c in h.corrections[-_SHOWN:]
+    ]
     rest = len(h.events) - _SHOWN
     more = [f"{counted(rest, 'earlier event')} in {setting('json')}"] if rest > 0 else []
     return [
@@ -97,6 +105,10 @@ def history_sections(history: History) -> list[Section]:
         Section(
             heading=[("events", "strong")] if events else "",
             parts=[Lines(lines=more), Lines(lines=events, hang=True, indent=4)],
+        ),
+        Section(
+            heading=[("corrections", "strong")] if corrected else "",
+            parts=[Lines(lines=corrected, hang=True, indent=4)],
         ),
     ]
 

@@ -117,7 +117,7 @@ _JOBS = (
     ),
     declare(
         "history",
-        "ledger bearing export alarms publish json plot report strict",
+        "ledger bearing every export alarms publish json plot report strict",
         ledger={"help": "The ledger: file of SQLite, or URL of PostgreSQL.", "required": True},
         bearing={
             "help": "Name of the bearing; without it all are listed.",

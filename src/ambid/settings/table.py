@@ -103,6 +103,13 @@ SETTINGS = (
     Setting("duration", "positive", "S", "Length of each record, in s.", shown="as ambid simulate"),
     Setting("eddy", "switch", "", "With @identify_nonlinear: the force follows the current with a pole a/(s + a)."),
     Setting("estimate", "path", "E.json", "With @modes: compare them with the modes of a physical estimate (MAC)."),
+    Setting(
+        "every",
+        "switch",
+        "",
+        "Also estimates that do not count: of each record and job the one of the newest version does.",
+        long="all",
+    ),
     Setting("every_s", "positive", "S", "Reporting interval, in s of record.", default=0.01),
     Setting(
         "excitation",
