@@ -28,7 +28,10 @@ def test_the_same_record_rig_settings_and_version_is_kept_once(demo, ambid, monk
     assert (first.code, first.err) == (0, "stored in l.db: pump 1, record of 2026-03-01 14:30 UTC\n")
     again = ambid(*WORDS, "--taken-at", "2026-03-01T14:30")
     assert again.out.splitlines()[0] == first.out.splitlines()[0]
-    assert again.err == "l.db has this already (same record, rig, settings and version); nothing was added\n"
+    assert again.err == (
+        "l.db has this already (same record, rig, settings and version): pump 1, record of 2026-03-01 14:30 UTC; "
+        "nothing was added\n"
+    )
     assert "stored in" in ambid(*WORDS, "--taken-at", "2026-04-01", "--from", "0.05").err  # other settings
     tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start", "0.2")
     assert (tracked.code, "stored in" in tracked.err) == (0, True)
@@ -110,3 +113,44 @@ def test_tables_are_exported_for_other_programs(demo, ambid, monkeypatch):
     pandas.DataFrame({"x": [1]}).to_parquet(demo / "tables" / "rig.parquet")
     done = ambid("history", "--ledger", "export.db", "--tables", "tables")
     assert (done.code, "rig.parquet exists, and is not of a ledger" in done.err) == (2, True)
+
+
+def test_a_ledger_is_corrected_and_says_how_that_is_undone(demo, ambid, monkeypatch):
+    monkeypatch.chdir(demo)
+    with open_ledger("wrong.db") as ledger:
+        ledger.add([entry(k, "pmup 1") for k in range(2)] + [entry(2, "pmup 1", taken_at=2.9e9)])
+    of = ("--ledger", "wrong.db")
+    done = ambid("history", "pmup 1", *of, "--rename", "pump 1", "--why", "misspelt", "--who", "anna")
+    said = "wrong.db: 'pmup 1' became 'pump 1' (3 estimates of 3 records). "
+    assert (done.code, done.out) == (0, f"{said}Undo: ambid history --ledger wrong.db --undo 1\n")
+    done = ambid("history", "pump 1", *of, "--redate", "2026-01-03", "--record", "day2.h5")
+    assert "day2.h5 of 2061-11-23 19:33 was taken 2026-01-03 00:00 (1 estimate" in done.out
+    assert "2 estimates of 2 records of" not in ambid("history", "pump 1", *of, "--remove", "--record", "day1.h5").out
+    shown = ambid("history", "pump 1", *of).out
+    assert ("2 estimates, 2026-01-01" in shown, "by anna: misspelt" in " ".join(shown.split())) == (True, True)
+    assert ambid("history", *of, "--undo", "3").code == 0
+    assert "3 estimates" in ambid("history", "pump 1", *of).out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("A", "--rename", "B", "--remove"), "--rename and --remove are 2 changes"),
+        (("--rename", "B"), "--rename is for one bearing. Name it"),
+        (("A", "--undo", "1"), "--undo takes a number alone"),
+        (("A", "--why", "x"), "--why is for --rename, --redate, --remove, --undo"),
+        (("A", "--rename", "B", "--json", "-"), "--json is not for --rename"),
+        (("A", "--redate", "monday"), "--redate is 'monday'; it must be a date and time"),
+        (("A", "--redate", "2026-01-01", "--record", "no.h5"), "--record no.h5: 'A' has no such record"),
+        (("A", "--all", "--alarms", "usual"), "--all is not for --alarms"),
+    ],
+)
+def test_a_correction_that_is_not_clear_is_refused(demo, ambid, monkeypatch, words, said):
+    monkeypatch.chdir(demo)
+    with open_ledger("right.db") as ledger:
+        ledger.add([entry(0), entry(1)])
+    done = ambid("history", *words, "--ledger", "right.db")
+    assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
+    assert said in done.err
+    assert ambid("history", "A", "--ledger", "none.db", "--remove").code == 2
+    assert not (demo / "none.db").exists()

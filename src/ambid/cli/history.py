@@ -9,12 +9,47 @@ import typer
 from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter
-from ambid.errors import counted
+from ambid.errors import AmbidError, counted
 from ambid.estimation.result import Result
 from ambid.job.files import METRICS_ENDINGS
-from ambid.settings.caller import refuse_given
+from ambid.settings.caller import command as command_of
+from ambid.settings.caller import refuse_given, setting
 
 _USUAL = "usual"
+_CHANGES = ("rename", "redate", "remove", "undo")
+
+
+def _corrected(v: Values) -> bool:
+    """Correct the ledger, where that is asked for."""
+    from ambid.ledger import open_ledger
+    from ambid.ledger.entry import moment
+
+    changes = [name for name in _CHANGES if v[name] not in (None, False)]
+    if not changes:
+        refuse_given(
+            v.only("record who why"), f"{{}} is for {', '.join(map(setting, _CHANGES))}. Give one, or omit {{}}"
+        )
+        return False
+    if len(changes) > 1:
+        raise AmbidError(f"{' and '.join(map(setting, changes))} are {len(changes)} changes. Make them one by one")
+    change = changes[0]
+    refuse_given(v.only("every export alarms publish json plot report strict"), f"{{}} is not for {setting(change)}")
+    if change == "undo":
+        refuse_given(v.only("bearing record"), "--undo takes a number alone. Omit {}")
+    elif v.bearing is None:
+        raise AmbidError(f"{setting(change)} is for one bearing. Name it")
+    about = {name: v[name] or "" for name in ("who", "why")}
+    with open_ledger(v.ledger, make=False) as ledger:
+        if change == "undo":
+            done = ledger.undo(v.undo, **about)
+        elif change == "rename":
+            done = ledger.rename(v.bearing, v.rename, record=v.record, **about)
+        elif change == "redate":
+            done = ledger.redate(v.bearing, moment(v.redate, "redate"), record=v.record, **about)
+        else:
+            done = ledger.remove(v.bearing, record=v.record, **about)
+        typer.echo(f"{ledger.shown}: {done.text}. Undo: {command_of('history', ledger=ledger.shown, undo=done.number)}")
+    return True
 
 
 @verb("history")
@@ -23,7 +58,12 @@ def command(v: Values) -> None:
 
     What no record showed is a gap and never a number. Without BEARING the bearings of the ledger are listed, and the
     records that gave no estimate. With --alarms and --strict the exit code is 3 where an alarm stands.
+
+    --rename, --redate and --remove correct the bearing, or one --record of it, and tell how that is undone. They hold
+    for later estimates of the same records too.
     """
+    if _corrected(v):
+        return
     from ambid.ledger import open_ledger, read_rules, watch
     from ambid.ledger.monitor import BUILT_IN
     from ambid.ledger.telling import publish, write_metrics

@@ -164,13 +164,17 @@ def _keep(
 ) -> str:  # fmt: skip
     """Put a result into a ledger, and say so; nothing is added where the same one is there."""
     from ambid.job.presentation import document
-    from ambid.ledger.entry import entry_of, sha_of
-    from ambid.report.history import day
+    from ambid.ledger.entry import REMOVED, day, entry_of, sha_of
 
     made = entry_of(
         result, bearing=bearing, sha=sha_of(*records), rig=rig, settings=settings, job=job, taken_at=taken_at,
         document=document(result),
     )  # fmt: skip
-    if ledger.add([made]):
-        return f"stored in {ledger.shown}: {made.bearing}, record of {day(made.taken_at)} UTC"
-    return f"{ledger.shown} has this already (same record, rig, settings and version); nothing was added"
+    new = ledger.add([made])
+    there = ledger.stored([made.key])[made.key]
+    place = f"{there.bearing}, record of {day(there.taken_at)} UTC"
+    if there.bearing == REMOVED:
+        place = f"what was removed, record of {day(there.taken_at)} UTC; 'ambid history --undo N' brings it back"
+    if new:
+        return f"stored in {ledger.shown}: {place}"
+    return f"{ledger.shown} has this already (same record, rig, settings and version): {place}; nothing was added"

@@ -288,6 +288,11 @@ def moment(text: str, name: str = "taken_at") -> float:
     return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).timestamp()
 
 
+def day(at: float) -> str:
+    """Write a time, s since 1970, as a date and time of UTC, to the minute."""
+    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M")
+
+
 @cache
 def tables() -> Any:
     """Return the tables for SQLite and PostgreSQL, as attributes of their metadata's ``tables`` by name."""

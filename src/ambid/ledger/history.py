@@ -184,10 +184,10 @@ def history_of(c: Connection, bearing: str, ledger: str, *, every: bool = False)
     )  # fmt: skip
 
 
-def bearing_of(c: Connection, bearing: str, ledger: str) -> tuple[int, str, str]:
-    """Return number, name and rig's name of a bearing; refuse one that is not there."""
+def bearing_of(c: Connection, bearing: str, ledger: str, *, own: bool = False) -> tuple[int, str, str]:
+    """Return number, name and rig's name of a bearing; refuse one that is not there, or but for `own` the ledger's."""
     (known,) = _rows(c, ("SELECT id, name, plant FROM bearing WHERE name = ?", bearing))
-    if known and not bearing.startswith(OWN):
+    if known and (own or not bearing.startswith(OWN)):
         return known[0]
     names = [name for rows in _rows(c, ("SELECT name FROM bearing ORDER BY name",)) for (name,) in rows]
     near = nearest(bearing, [name for name in names if not name.startswith(OWN)])

@@ -43,7 +43,7 @@ def server_engine(url: str) -> tuple[Engine, str]:
     return create_engine(address.set(drivername="postgresql+psycopg")), address.render_as_string()
 
 
-def file_engine(path: Path, *, write: bool) -> tuple[Engine, str]:
+def file_engine(path: Path, *, write: bool, make: bool) -> tuple[Engine, str]:
     """Return the engine of a file of SQLite, and its name; refuse what is none, untouched."""
     from sqlalchemy import create_engine, event
     from sqlalchemy.pool import StaticPool
@@ -52,7 +52,7 @@ def file_engine(path: Path, *, write: bool) -> tuple[Engine, str]:
     new = not path.exists() or path.stat().st_size == 0
     if path.is_dir() or (path.exists() and not path.is_file()):
         raise AmbidError(f"ledger {path} is no file. Name one, such as fleet.db")
-    if new and not write:
+    if new and not make:
         raise AmbidError(f"ledger {path} {'is empty' if path.exists() else 'does not exist'}. Check the path")
     if new and not path.resolve().parent.is_dir():
         raise AmbidError(f"ledger {path}: there is no folder {path.parent}. Make it first, or correct the path")
@@ -141,7 +141,7 @@ def _connected(path: Path, mode: str, patience_s: float) -> Any:
     )  # fmt: skip
 
 
-def make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
+def make_ready(engine: Engine, ledger: str, *, write: bool, make: bool) -> None:
     """Make the tables where there are none; bring them to this version; refuse what is of another kind or newer."""
     from sqlalchemy import insert, inspect, select, update
 
@@ -152,7 +152,7 @@ def make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
         if write and engine.dialect.name == "postgresql":
             c.exec_driver_sql("SELECT pg_advisory_xact_lock(7281001)")  # one writer at a time makes tables
         there = set(inspect(c).get_table_names()) & set(whole.tables)
-        if not there and not write:
+        if not there and not make:
             raise AmbidError(f"ledger {ledger} holds no ledger yet. Check the URL")
         if not there:
             whole.create_all(c)

@@ -12,22 +12,22 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from ambid.errors import counted, needs
 from ambid.estimation.result import Reason, Result
-from ambid.ledger import entry
-from ambid.ledger.entry import Entry, key_of
+from ambid.ledger import correcting, entry
+from ambid.ledger.correcting import Stored
+from ambid.ledger.entry import Correction, Entry, key_of
 from ambid.ledger.opening import file_engine, in_one_line, make_ready, server_engine
+from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in, estimate_numbers, insert_new
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection, Engine
 
     from ambid.ledger.history import History
-
-_MANY = 5_000  # keys in one question
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +58,9 @@ class KnownBearing:
     estimates: int
     first: float
     last: float
+
+
+_MOVING = 7281002  # lock of a server, held by who corrects a ledger
 
 
 class Ledger:
@@ -108,10 +111,11 @@ class Ledger:
 
         t = entry.tables().tables
         with self._writing() as c:
-            bearings, now = self._bearings(c, batch.values()), time.time()
+            batch, now = _as_corrected(c, batch), time.time()
+            bearings = bearing_numbers(c, {e.bearing: e.rig_name for e in batch.values()})
             rigs = {e.rig_sha: {"sha": e.rig_sha, "name": e.rig_name, "text": _packed(e.rig)} for e in batch.values()}
-            self._insert(c, t["rig"], [rigs[sha] for sha in sorted(rigs)])
-            first = self._numbers(c, len(batch))
+            insert_new(c, t["rig"], [rigs[sha] for sha in sorted(rigs)])
+            first = estimate_numbers(c, len(batch))
             new = dict(zip(first, batch.values(), strict=True))
             rows = [
                 {
@@ -121,21 +125,19 @@ class Ledger:
                 }
                 for (key, e), number in zip(batch.items(), first, strict=True)
             ]  # fmt: skip
-            self._insert(c, t["estimate"], rows)
-            there = self._there(c, batch)
+            insert_new(c, t["estimate"], rows)
+            there = _there(c, batch)
             new = {number: e for number, e in new.items() if there[e.key] == number}
-            self._copy(c, t["value"], [row for n, e in new.items() for row in _values(n, bearings[e.bearing], e)])
-            self._insert(
-                c, t["document"], [_document(n, e) for n, e in new.items() if e.document or e.covariance_names]
-            )
-            self._insert(
+            copy_in(c, t["value"], [row for n, e in new.items() for row in _values(n, bearings[e.bearing], e)])
+            insert_new(c, t["document"], [_document(n, e) for n, e in new.items() if e.document or e.covariance_names])
+            insert_new(
                 c, t["event"],
                 [
                     {"bearing": bearings[e.bearing], "estimate": n, **{x: getattr(v, x) for x in v.__slots__}}
                     for n, e in new.items() for v in e.events
                 ],
             )  # fmt: skip
-            for keys in _chunks(list(batch)):
+            for keys in chunks(list(batch)):
                 c.execute(delete(t["failure"]).where(t["failure"].c.key.in_(keys)))
         return frozenset(e.key for e in new.values())
 
@@ -155,9 +157,9 @@ class Ledger:
 
         t = entry.tables().tables["failure"]
         with self._writing() as c:
-            for keys in _chunks(list(rows)):
+            for keys in chunks(list(rows)):
                 c.execute(delete(t).where(t.c.key.in_(keys)))
-            self._insert(c, t, list(rows.values()))
+            insert_new(c, t, list(rows.values()))
 
     def documents(self, keys: Iterable[str]) -> Mapping[str, tuple[str, str, str, str]]:
         """Return status, verdict, failed checks and JSON of estimates that are there, by key.
@@ -181,7 +183,7 @@ class Ledger:
         with self._reading() as c:
             return {
                 row.key: (row.status, row.verdict, row.failed, zlib.decompress(row.json).decode() if row.json else "")
-                for some in _chunks(list(keys))
+                for some in chunks(list(keys))
                 for row in c.execute(query.where(e.key.in_(some)))
             }
 
@@ -244,6 +246,127 @@ class Ledger:
         with self._reading() as c:
             return history_of(c, bearing, self.shown, every=every)
 
+    def rename(self, bearing: str, new: str, *, record: str | None = None, who: str = "", why: str = "") -> Correction:
+        """Give a bearing another name; where there is one of that name, it gets the estimates too.
+
+        Later estimates of the same records go there as well. `undo` takes it back.
+
+        Parameters
+        ----------
+        bearing, new : str
+        record : str, optional
+            Only this record: name of its file, or digits of its SHA-256.
+        who, why : str, optional
+            Who corrects, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If there is no such bearing or record.
+        """
+        with self._writing(alone=True) as c:
+            return correcting.rename(c, self.shown, bearing, new, record, who=who, why=why)
+
+    def redate(
+        self, bearing: str, taken_at: float, *, record: str | None = None, who: str = "", why: str = ""
+    ) -> Correction:
+        """Say when a record was taken; all estimates of it go there, later ones as well. `undo` takes it back.
+
+        Parameters
+        ----------
+        bearing : str
+        taken_at : float
+            S since 1970, UTC.
+        record : str, optional
+            Name of its file, or digits of its SHA-256; default the only one of the bearing.
+        who, why : str, optional
+            Who corrects, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If there is no such bearing or record, or it is not clear which.
+        """
+        with self._writing(alone=True) as c:
+            return correcting.redate(c, self.shown, bearing, taken_at, record, who=who, why=why)
+
+    def remove(self, bearing: str, *, record: str | None = None, who: str = "", why: str = "") -> Correction:
+        """Take a bearing, or one record, out of all histories; later estimates of it stay out. `undo` takes it back.
+
+        Parameters
+        ----------
+        bearing : str
+        record : str, optional
+            Only this record: name of its file, or digits of its SHA-256.
+        who, why : str, optional
+            Who corrects, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If there is no such bearing or record.
+        """
+        with self._writing(alone=True) as c:
+            return correcting.remove(c, self.shown, bearing, record, who=who, why=why)
+
+    def undo(self, number: int, *, who: str = "", why: str = "") -> Correction:
+        """Put estimates where they were before a correction; that is one too, and can be undone.
+
+        Parameters
+        ----------
+        number : int
+            Of the correction.
+        who, why : str, optional
+            Who corrects, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If there is no such correction, or all is as before it already.
+        """
+        with self._writing(alone=True) as c:
+            return correcting.undo(c, self.shown, number, who=who, why=why)
+
+    def corrections(self) -> tuple[Correction, ...]:
+        """Return all corrections, in order.
+
+        Returns
+        -------
+        tuple of Correction
+        """
+        with self._reading() as c:
+            return correcting.corrections(c)
+
+    def stored(self, keys: Iterable[str]) -> Mapping[str, Stored]:
+        """Return where estimates are, by key; those that are not there are passed over.
+
+        Parameters
+        ----------
+        keys : iterable of str
+
+        Returns
+        -------
+        Mapping of str to Stored
+        """
+        with self._reading() as c:
+            return {e.key: e for e in correcting.stored_by_key(c, keys)}
+
     def export(self, folder: str | Path, *, every: bool = False) -> tuple[str, ...]:
         """Write the tables as Parquet files, for DuckDB or pandas; needs the extra ``ambid[formats]``.
 
@@ -274,8 +397,11 @@ class Ledger:
     # --- inside -----------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def _writing(self) -> Iterator[Connection]:
+    def _writing(self, *, alone: bool = False) -> Iterator[Connection]:
+        """Yield a transaction that others may write beside; `alone`: that moves what they add to, and so waits."""
         with in_one_line(self.shown), self._engine.begin() as c:
+            if self._postgres:
+                c.exec_driver_sql(f"SELECT pg_advisory_xact_lock{'' if alone else '_shared'}({_MOVING})")
             yield c
 
     @contextmanager
@@ -293,58 +419,29 @@ class Ledger:
     def _postgres(self) -> bool:
         return self._engine.dialect.name == "postgresql"
 
-    def _insert(self, c: Connection, table: Any, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Insert rows, but those that are there."""
-        if self._postgres:
-            from sqlalchemy.dialects.postgresql import insert
-        else:
-            from sqlalchemy.dialects.sqlite import insert  # type: ignore[assignment]
-        if rows:
-            c.execute(insert(table).on_conflict_do_nothing(), [dict(row) for row in rows])
 
-    def _copy(self, c: Connection, table: Any, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Insert rows of all columns, in their order, of which none is there; by COPY where there is one."""
-        if self._postgres:
-            names = ", ".join(column.name for column in table.columns)
-            driver: Any = c.connection.driver_connection
-            with driver.cursor() as cursor, cursor.copy(f"COPY {table.name} ({names}) FROM STDIN") as copy:
-                for row in rows:
-                    copy.write_row(row)
-        elif rows:
-            marks = ", ".join("?" * len(table.columns))
-            c.exec_driver_sql(f"INSERT INTO {table.name} VALUES ({marks})", list(rows))
+def _there(c: Connection, keys: Iterable[str]) -> dict[str, int]:
+    """Return the numbers of estimates that are there, by key."""
+    from sqlalchemy import select
 
-    def _numbers(self, c: Connection, n: int) -> Sequence[int]:
-        """Return numbers for n new estimates, which no other writer gets."""
-        if self._postgres:
-            query = "SELECT nextval('estimate_id') FROM generate_series(1, %s)"
-            return [row[0] for row in c.exec_driver_sql(query, (n,))]
-        last = c.exec_driver_sql("SELECT coalesce(max(id), 0) FROM estimate").scalar_one()
-        return range(last + 1, last + 1 + n)
+    t = entry.tables().tables["estimate"]
+    return {
+        row.key: row.id
+        for some in chunks(list(keys))
+        for row in c.execute(select(t.c.key, t.c.id).where(t.c.key.in_(some)))
+    }
 
-    def _bearings(self, c: Connection, entries: Iterable[Entry]) -> dict[str, int]:
-        """Return the numbers of bearings by name; one that is new is entered."""
-        from sqlalchemy import select
 
-        t = entry.tables().tables["bearing"]
-        plants = {e.bearing: e.rig_name for e in entries}
-        self._insert(c, t, [{"name": name, "plant": plants[name]} for name in sorted(plants)])
-        return {
-            row.name: row.id
-            for names in _chunks(list(plants))
-            for row in c.execute(select(t.c.name, t.c.id).where(t.c.name.in_(names)))
-        }
-
-    def _there(self, c: Connection, keys: Iterable[str]) -> dict[str, int]:
-        """Return the numbers of estimates that are there, by key."""
-        from sqlalchemy import select
-
-        t = entry.tables().tables["estimate"]
-        return {
-            row.key: row.id
-            for some in _chunks(list(keys))
-            for row in c.execute(select(t.c.key, t.c.id).where(t.c.key.in_(some)))
-        }
+def _as_corrected(c: Connection, entries: Mapping[str, Entry]) -> dict[str, Entry]:
+    """Return entries by key, with bearing and time as corrections of their records said."""
+    known = assignments(c, (e.sha for e in entries.values()))
+    done = dict(entries)
+    for key, e in entries.items() if known else ():
+        bearing, taken_at = known.get((e.sha, e.bearing), (e.bearing, None))
+        later = 0.0 if taken_at is None else taken_at - e.taken_at
+        events = tuple(replace(v, at=v.at + later) for v in e.events)
+        done[key] = replace(e, bearing=bearing, taken_at=e.taken_at + later, events=events)
+    return done
 
 
 _PLAIN = (
@@ -369,10 +466,6 @@ def _packed(text: str) -> bytes:
     return zlib.compress(text.encode())
 
 
-def _chunks(items: Sequence[str]) -> Iterator[Sequence[str]]:
-    return (items[k : k + _MANY] for k in range(0, len(items), _MANY))
-
-
 def _mappings(c: Connection, query: Any) -> Sequence[Any]:
     return c.execute(query).mappings().all()
 
@@ -380,7 +473,7 @@ def _mappings(c: Connection, query: Any) -> Sequence[Any]:
 # --- opening --------------------------------------------------------------------------------------------------------
 
 
-def open_ledger(where: str | Path, *, write: bool = True) -> Ledger:
+def open_ledger(where: str | Path, *, write: bool = True, make: bool = True) -> Ledger:
     """Open a ledger; for writing it is made where there is none, and brought to this version where it is older.
 
     Parameters
@@ -389,6 +482,8 @@ def open_ledger(where: str | Path, *, write: bool = True) -> Ledger:
         File of SQLite, or URL of PostgreSQL, ``postgresql://user@host/name``.
     write : bool, optional
         False: nothing is written, and a ledger that is not there is refused.
+    make : bool, optional
+        False: a ledger that is not there is refused, also for writing.
 
     Returns
     -------
@@ -402,11 +497,11 @@ def open_ledger(where: str | Path, *, write: bool = True) -> Ledger:
     with needs("SQLAlchemy", "a ledger", "fleet"):
         import sqlalchemy  # noqa: F401
     text = str(where)
-    engine, name = server_engine(text) if "://" in text else file_engine(Path(text), write=write)
+    engine, name = server_engine(text) if "://" in text else file_engine(Path(text), write=write, make=write and make)
     ledger = Ledger(engine, name)
     try:
         with in_one_line(name):
-            make_ready(engine, name, write=write)
+            make_ready(engine, name, write=write, make=write and make)
     except BaseException:
         ledger.close()
         raise

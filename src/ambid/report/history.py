@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
-from datetime import UTC, datetime
+from datetime import UTC
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from ambid.arrays import Array
 from ambid.control.zones import Zone
 from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95
-from ambid.ledger.entry import Note
+from ambid.ledger.entry import Note, day
 from ambid.ledger.history import History, Series
 from ambid.ledger.monitor import Alarm, Trend, Watched
 from ambid.ledger.store import Failure, KnownBearing
@@ -45,11 +45,6 @@ if TYPE_CHECKING:
 
 
 _SHOWN = 12  # events, and failures
-
-
-def day(at: float) -> str:
-    """Write a time, s since 1970, as a date and time of UTC, to the minute."""
-    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M")
 
 
 def percent(value: float, sd: float) -> str:

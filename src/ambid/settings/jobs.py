@@ -117,7 +117,14 @@ _JOBS = (
     ),
     declare(
         "history",
-        "ledger bearing every export alarms publish json plot report strict",
+        "ledger bearing every rename redate remove record undo who why export alarms publish json plot report strict",
+        record={
+            "kind": "text",
+            "help": "Only this record of the bearing: name of its file, or digits of its SHA-256.",
+            "metavar": "NAME|SHA",
+            "argument": False,
+            "required": False,
+        },
         ledger={"help": "The ledger: file of SQLite, or URL of PostgreSQL.", "required": True},
         bearing={
             "help": "Name of the bearing; without it all are listed.",

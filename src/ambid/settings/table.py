@@ -336,6 +336,7 @@ SETTINGS = (
         required=True,
     ),
     Setting("redesign", "switch", "", "Design a better loop, load it on trial, and measure again."),
+    Setting("redate", "text", "TIME", "When @record was taken, such as 2026-03-01T14:30, of UTC."),
     Setting(
         "reference",
         "text",
@@ -343,6 +344,8 @@ SETTINGS = (
         "Column of the loop's external excitation, for methods that use it; repeatable.",
         many=True,
     ),
+    Setting("remove", "switch", "", "Take the bearing, or one @record, out of all that is shown and judged."),
+    Setting("rename", "text", "NAME", "Give the bearing, or one @record, this name; one that has it gets them too."),
     Setting("report", "path", "FILE.html", "Write a report in one self-contained file, .html or .pdf."),
     Setting(
         "result",
@@ -462,7 +465,12 @@ SETTINGS = (
         "Part of the way to the limits of position and current that may be used.",
         default=0.3,
     ),
+    Setting(
+        "undo", "whole", "N", "Put back what correction N changed; the history of the bearing numbers them.", least=1
+    ),
     Setting("validate", "path", "RECORD2", "Validate on this record too, on all of it."),
+    Setting("who", "text", "NAME", "Who does this.", shown="account and host"),
+    Setting("why", "text", "TEXT", "For what reason."),
     Setting(
         "widest",
         "positive",
