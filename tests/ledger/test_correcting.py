@@ -99,6 +99,24 @@ def test_a_correction_holds_for_later_estimates_of_its_records(ledger):
     assert [b.name for b in ledger.bearings()] == ["pmup 1", "pump one"]  # a record of which nothing was said
 
 
+def test_an_undo_takes_back_what_that_correction_changed_and_nothing_else(ledger):
+    ledger.rename("pmup 1", "P")
+    ledger.redate("P", BEGIN + 2 * DAY, record="day2.h5")
+    ledger.undo(1)
+    assert [e.taken_at for e in ledger.history("pmup 1").estimates] == [BEGIN, BEGIN + DAY, BEGIN + 2 * DAY]
+    ledger.rename("pmup 1", "P")
+    ledger.undo(2)
+    assert [e.taken_at for e in ledger.history("P").estimates] == [BEGIN, BEGIN + DAY, LATE]
+
+
+def test_an_undo_brings_back_what_came_to_the_removed_since(ledger):
+    ledger.remove("pmup 1", record="day0.h5")
+    ledger.add([entry(0, "pmup 1", version="9.0.0")])
+    ledger.undo(1)
+    assert ledger.history("pmup 1").estimates[0].version == "9.0.0"
+    assert ledger.history("pmup 1").left_out == 1
+
+
 def test_there_and_back_leaves_names_as_they_are(ledger):
     for names in (("pmup 1", "B"), ("B", "pmup 1"), ("pmup 1", "B"), ("B", "C")):
         ledger.rename(*names)

@@ -33,6 +33,7 @@ DOORS = {
         "track": "track parameters through a record, as on-line",
         "design": "design the next experiment or the controller on a model",
         "history": "show a bearing over time, from a ledger",
+        "ledger": "check, back up, restore, merge and thin a ledger",
         "fleet": "do a job on many records, real or simulated",
     },
     "Research in identification": {

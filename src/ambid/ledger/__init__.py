@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
+    from ambid.ledger.entry import Correction as Correction
     from ambid.ledger.entry import Entry as Entry
     from ambid.ledger.entry import entry_of as entry_of
     from ambid.ledger.history import History as History

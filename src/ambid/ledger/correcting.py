@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _LEAST = 6  # digits of a SHA-256 that name a record
 _SHOWN = 4  # records in a refusal
 Place = tuple[str, float]  # bearing, and time of the record
+Before = tuple[str | None, float | None]  # those of them that a correction changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +40,7 @@ class Stored:
     record: str
     bearing: str
     taken_at: float
+    added_at: float
 
 
 def rename(c: Connection, ledger: str, bearing: str, new: str, record: str | None, **about: str) -> Correction:
@@ -49,7 +51,7 @@ def rename(c: Connection, ledger: str, bearing: str, new: str, record: str | Non
     if name == bearing:
         raise AmbidError(f"{setting('rename', repr(new))}: the bearing has that name already. Give another")
     own = estimates_of(c, ledger, bearing, record)
-    there = {e.sha for e in stored(c, lambda b, _: b.name == name)}
+    there = {e.sha for e in stored(c, partial(_has_name, name))}
     twice = {e.sha: e for e in own if e.sha in there}
     text = f"{bearing!r} became {name!r} ({_counted(own)})"
     if twice:
@@ -83,29 +85,45 @@ def remove(c: Connection, ledger: str, bearing: str, record: str | None, **about
 
 def undo(c: Connection, ledger: str, number: int, **about: str) -> Correction:
     """Put estimates where they were before a correction."""
-    known = c.exec_driver_sql("SELECT id, kind, bearing, text, old FROM correction").all()
+    known = c.exec_driver_sql("SELECT id, at, bearing, text, old FROM correction ORDER BY id").all()
     row = next((row for row in known if row.id == number), None)
     if row is None:
         raise AmbidError(
             f"{setting('undo', number)}: ledger {ledger} has no such correction; it has "
             f"{_some([str(x.id) for x in known]) or 'none'}. Correct it"
         )
-    old: Mapping[str, Place | None] = json.loads(zlib.decompress(row.old))
-    own = [e for e in stored_by_key(c, old) if e.bearing != ARCHIVED]
-    moves: dict[str, Place] = {}
-    for e in own:
-        bearing, taken_at = old[e.key] or (REMOVED, e.taken_at)
-        moves[e.key] = (bearing, taken_at)
-    own = [e for e in own if (e.bearing, e.taken_at) != moves[e.key]]
+    moves = _back(c, json.loads(zlib.decompress(row.old)), row.at)
+    own = [e for e in stored_by_key(c, moves) if (e.bearing, e.taken_at) != moves[e.key]]
     if not own:
         raise AmbidError(
-            f"{setting('undo', number)}: of correction {number} ({row.text}) nothing is left to be undone. See 'ambid "
-            "ledger merge' for what was archived, 'ambid ledger restore' for what was replaced"
+            f"{setting('undo', number)}: of correction {number} ({row.text}) nothing is left to be undone. What was "
+            "archived comes back by 'ambid ledger merge', what was replaced by 'ambid ledger restore'"
         )
     names = {moves[e.key][0] for e in own} - {REMOVED}
     bearing = names.pop() if len(names) == 1 else row.bearing
     text = f"correction {number} undone ({row.text})"
     return correct(c, own, moves, "undo", bearing, text, **about)
+
+
+def _back(c: Connection, old: Mapping[str, Before | None], since: float) -> dict[str, Place]:
+    """Return where estimates go back to, with those of the same records that came to them since; `old`: by key."""
+    moves: dict[str, Place] = {}
+    records: dict[str, dict[str, Before]] = {}  # of each bearing, those of whose estimates more may have come
+    for e in stored_by_key(c, old):
+        before = old[e.key]
+        if e.bearing != ARCHIVED:
+            moves[e.key] = (REMOVED, e.taken_at) if before is None else _put_back(e, before)
+            records.setdefault(e.bearing, {}).update({} if before is None else {e.sha: before})
+    for name, of in records.items():
+        for e in stored(c, partial(_has_name, name)) if of else ():
+            if e.sha in of and e.added_at > since and e.key not in old:
+                moves[e.key] = _put_back(e, of[e.sha])
+    return moves
+
+
+def _put_back(e: Stored, before: Before) -> Place:
+    bearing, taken_at = before
+    return e.bearing if bearing is None else bearing, e.taken_at if taken_at is None else taken_at
 
 
 def corrections(c: Connection) -> tuple[Correction, ...]:
@@ -119,6 +137,17 @@ def correct(
 ) -> Correction:
     """Move estimates, `own` as they are now, to bearings and times by key, and keep where they were."""
     _assign(c, own, moves)
+    place(c, own, moves)
+    old = {e.key: _changed(e, moves[e.key]) for e in own}
+    return note(c, kind, bearing, text, old, **about)
+
+
+def _changed(e: Stored, to: Place) -> Before:
+    return None if to[0] == e.bearing else e.bearing, None if to[1] == e.taken_at else e.taken_at
+
+
+def place(c: Connection, own: Sequence[Stored], moves: Mapping[str, Place]) -> None:
+    """Move estimates, `own` as they are now, to bearings and times by key."""
     plants = {name: bearing_of(c, name, "", own=True) for name in {e.bearing for e in own}}
     targets = bearing_numbers(c, {moves[e.key][0]: plants[e.bearing][2] for e in own})
     for name, (number, *_) in plants.items():
@@ -126,13 +155,12 @@ def correct(
         _move(c, number, {e.number: (targets[moves[e.key][0]], *moves[e.key][1:]) for e in some})
         target = Counter(moves[e.key][0] for e in some).most_common(1)[0][0]
         _follow(c, (number, name), (targets[target], target))
-    return note(c, kind, bearing, text, {e.key: (e.bearing, e.taken_at) for e in own}, **about)
 
 
 def note(
-    c: Connection, kind: str, bearing: str, text: str, old: Mapping[str, Place | None], who: str = "", why: str = ""
+    c: Connection, kind: str, bearing: str, text: str, old: Mapping[str, Before | None], who: str = "", why: str = ""
 ) -> Correction:
-    """Enter a correction; `old`: place of each estimate before, by key; none where it was not there."""
+    """Enter a correction; `old`: what each estimate had before, by key; none where it was not there."""
     from sqlalchemy import insert
 
     facts: Any = {"at": time.time(), "who": who or _user(), "kind": kind, "bearing": bearing, "text": text, "why": why}
@@ -210,7 +238,7 @@ def _follow(c: Connection, source: tuple[int, str], target: tuple[int, str]) -> 
 def estimates_of(c: Connection, ledger: str, bearing: str, record: str | None) -> list[Stored]:
     """Return the estimates of a bearing, or of one record of it, by the name of its file or digits of its SHA-256."""
     bearing_of(c, bearing, ledger)
-    own = stored(c, lambda b, _: b.name == bearing)
+    own = stored(c, partial(_has_name, bearing))
     if record is None:
         return own
     of = [
@@ -241,13 +269,17 @@ def stored(c: Connection, where: Callable[[Any, Any], Any]) -> list[Stored]:
 
     t = tables().tables
     b, e = t["bearing"].c, t["estimate"].c
-    query = select(e.key, e.id, e.sha, e.record, b.name, e.taken_at).join_from(t["estimate"], t["bearing"])
+    query = select(e.key, e.id, e.sha, e.record, b.name, e.taken_at, e.added_at).join_from(t["estimate"], t["bearing"])
     return [Stored(*row) for row in c.execute(query.where(where(b, e)).order_by(e.taken_at, e.id))]
 
 
 def stored_by_key(c: Connection, keys: Iterable[str]) -> list[Stored]:
     """Return estimates by their keys; those that are not there are passed over."""
     return [e for some in chunks(list(keys)) for e in stored(c, partial(_has_key, some))]
+
+
+def _has_name(name: str, bearing: Any, _: Any) -> Any:
+    return bearing.name == name
 
 
 def _has_key(keys: Sequence[str], _: Any, estimate: Any) -> Any:

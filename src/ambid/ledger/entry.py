@@ -56,14 +56,29 @@ ARCHIVED = f"{OWN}archived"  # whose values, events and documents are in another
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A change of what a ledger holds; what was there before is kept, and undone by its number."""
+    """A change of what a ledger holds; what was there before is kept, and put back by its number.
+
+    Attributes
+    ----------
+    number : int
+    at : float
+        When it was made, s since 1970, UTC.
+    who : str
+    kind : str
+        "rename", "redate", "remove", "undo", "merge", "restore" or "retain".
+    bearing : str
+        Empty where it is of the whole ledger.
+    text : str
+        What changed.
+    why : str
+    """
 
     number: int
-    at: float  # when it was made, s since 1970, UTC
+    at: float
     who: str
-    kind: str  # "rename", "redate", "remove", "merge", "retain", "restore" or "undo"
+    kind: str
     bearing: str
-    text: str  # what changed
+    text: str
     why: str
 
 

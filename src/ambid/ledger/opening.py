@@ -23,6 +23,10 @@ _TRY_S = 0.5  # of it, in which the program hears nothing
 _MAPPED = 1 << 30  # bytes of a file that are read without a copy
 
 
+class OlderLedgerError(AmbidError):
+    """A ledger to be read is of an older version."""
+
+
 def server_engine(url: str) -> tuple[Engine, str]:
     """Return the engine of a server, and its URL without the password."""
     from sqlalchemy import create_engine
@@ -57,7 +61,7 @@ def file_engine(path: Path, *, write: bool, make: bool) -> tuple[Engine, str]:
     if new and not path.resolve().parent.is_dir():
         raise AmbidError(f"ledger {path}: there is no folder {path.parent}. Make it first, or correct the path")
     if not new:
-        _check_file(path)
+        check_file(path)
 
     def connect() -> Any:
         connection = _connected(path, "rwc", _TRY_S) if write else _read_only(path, _TRY_S, "rw")  # leaves no log
@@ -90,7 +94,7 @@ def _patiently(do: Callable[[], object]) -> None:
                 raise
 
 
-def _check_file(path: Path) -> None:
+def check_file(path: Path) -> None:
     """Refuse a file that is no database, or that of another program, without touching it."""
     import sqlite3
 
@@ -176,9 +180,9 @@ def make_ready(engine: Engine, ledger: str, *, write: bool, make: bool) -> None:
                 f"ledger {ledger} is of version {version}; this ambid reads {entry.VERSION}. Install a newer one"
             )
         if version < entry.VERSION and not write:
-            raise AmbidError(
-                f"ledger {ledger} is of version {version}, and is read as {entry.VERSION}. Write to it once, which "
-                "brings it to that version"
+            raise OlderLedgerError(
+                f"ledger {ledger} is of version {version}, and is read as {entry.VERSION}. 'ambid ledger check' brings "
+                "it to that version"
             )
         for step in range(version, entry.VERSION):
             for statement in entry.STEPS[step]:

@@ -11,17 +11,26 @@ import time
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from ambid.errors import counted, needs
+from ambid.errors import AmbidError, counted, needs
 from ambid.estimation.result import Reason, Result
-from ambid.ledger import correcting, entry
+from ambid.ledger import checking, copying, correcting, entry
+from ambid.ledger.copying import Keep
 from ambid.ledger.correcting import Stored
 from ambid.ledger.entry import Correction, Entry, key_of
-from ambid.ledger.opening import file_engine, in_one_line, make_ready, server_engine
+from ambid.ledger.opening import (
+    OlderLedgerError,
+    check_file,
+    file_engine,
+    in_one_line,
+    make_ready,
+    server_engine,
+)
 from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in, estimate_numbers, insert_new
 
 if TYPE_CHECKING:
@@ -343,6 +352,132 @@ class Ledger:
         with self._writing(alone=True) as c:
             return correcting.undo(c, self.shown, number, who=who, why=why)
 
+    def merge(self, other: str | Path, *, who: str = "", why: str = "") -> Correction:
+        """Add what another ledger has and this one lacks, corrections and failures included. `undo` removes it.
+
+        Parameters
+        ----------
+        other : str or Path
+            File or URL; it stays as it is.
+        who, why : str, optional
+            Who does this, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If the other one is no ledger.
+        """
+        with readable(other) as source:
+            self._refuse_itself(source)
+            with source._reading() as c0, self._writing(alone=True) as c:
+                return copying.merge(c0, c, source.shown, who=who, why=why)
+
+    def backup(self, path: str | Path) -> int:
+        """Write all that is here into a file of SQLite; one that is there is replaced once the new one is whole.
+
+        Parameters
+        ----------
+        path : str or Path
+
+        Returns
+        -------
+        int
+            Number of estimates.
+
+        Raises
+        ------
+        AmbidError
+            If the file cannot be written.
+        """
+        if str(Path(path).resolve()) == self._identity:
+            raise AmbidError(f"{path} is the ledger itself. Give another file")
+        with self._reading() as c0, _new_file(Path(path)) as new:
+            with new._writing() as c:
+                count = len(copying.copy(c0, c))
+            new._pragma("PRAGMA journal_mode = DELETE")  # one file alone, also for those who read it
+        return count
+
+    def restore(self, backup: str | Path, *, who: str = "", why: str = "") -> Correction:
+        """Put what a backup, or another ledger, holds in place of all that is here.
+
+        Parameters
+        ----------
+        backup : str or Path
+            File or URL; it stays as it is.
+        who, why : str, optional
+            Who does this, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If the backup is no ledger, or is damaged: all stays as it was.
+        """
+        with readable(backup) as source:
+            self._refuse_itself(source)
+            wrong = source.check()
+            if wrong:
+                raise AmbidError(f"{source.shown} is damaged: {wrong[0]}. Restore another backup")
+            with source._reading() as c0, self._writing(alone=True) as c:
+                return copying.restore(c0, c, source.shown, who=who, why=why)
+
+    def retain(
+        self, archive: str | Path, *, before: float, keep: Keep = "none", who: str = "", why: str = ""
+    ) -> Correction:
+        """Move what was taken before a time into an archive; `merge` of the archive brings it back.
+
+        It is first there, then gone here. Of each estimate a row stays, so that a fleet does not do it again.
+
+        Parameters
+        ----------
+        archive : str or Path
+            Ledger, made where there is none.
+        before : float
+            S since 1970, UTC.
+        keep : str, optional
+            One usable estimate of each bearing, job and ``"day"``, ``"week"``, ``"month"`` or ``"year"`` stays.
+        who, why : str, optional
+            Who does this, default the account, and for what reason.
+
+        Returns
+        -------
+        Correction
+
+        Raises
+        ------
+        AmbidError
+            If one of the two cannot be written.
+        """
+        with open_ledger(archive) as other:
+            self._refuse_itself(other)
+            with self._reading() as c0, other._writing(alone=True) as c:
+                keys = copying.to_move(c0, before, keep)
+                copying.copy(c0, c, keys)
+            rule = f"from before {entry.day(before)}" + ("" if keep == "none" else f", but for one a {keep},")
+            with self._writing(alone=True) as c:
+                done = copying.hollow(c, keys, other.shown, rule, who=who, why=why)
+        if not self._postgres:
+            with suppress(AmbidError):  # where somebody reads
+                self._pragma("VACUUM")  # gives the room back
+        return done
+
+    def check(self) -> tuple[str, ...]:
+        """Return what is wrong with the ledger, a line each; nothing where it is whole.
+
+        Returns
+        -------
+        tuple of str
+        """
+        with self._reading() as c:
+            return checking.faults(c)
+
     def corrections(self) -> tuple[Correction, ...]:
         """Return all corrections, in order.
 
@@ -414,6 +549,22 @@ class Ledger:
                 if self._postgres:
                     c.invalidate()  # given back to the pool, a lost connection would be told with a traceback
                 raise
+
+    def _pragma(self, statement: str) -> None:
+        """Execute what SQLite takes outside of a transaction."""
+        with in_one_line(self.shown), closing(self._engine.raw_connection()) as raw:
+            raw.cursor().execute(statement).fetchall()
+
+    def _refuse_itself(self, other: Ledger) -> None:
+        if self._identity == other._identity:
+            raise AmbidError(f"{other.shown} is the ledger itself. Give another")
+
+    @property
+    def _identity(self) -> str:
+        """What no other ledger has: of a file its place, of a database its name and the start of its server."""
+        query = "SELECT current_database() || pg_postmaster_start_time()" if self._postgres else "PRAGMA database_list"
+        with self._reading() as c:
+            return str(c.exec_driver_sql(query).all()[0][0 if self._postgres else 2])
 
     @property
     def _postgres(self) -> bool:
@@ -506,6 +657,55 @@ def open_ledger(where: str | Path, *, write: bool = True, make: bool = True) -> 
         ledger.close()
         raise
     return ledger
+
+
+@contextmanager
+def readable(where: str | Path) -> Iterator[Ledger]:
+    """Open a ledger to copy from; a file of an older version is brought to this one in a copy, and stays as it is."""
+    try:
+        ledger = open_ledger(where, write=False)
+    except OlderLedgerError:
+        if "://" in str(where):
+            raise
+        import sqlite3
+
+        with TemporaryDirectory() as folder:
+            copy = Path(folder) / "copy.db"
+            old, new = sqlite3.connect(f"{Path(where).resolve().as_uri()}?mode=ro", uri=True), sqlite3.connect(copy)
+            old.backup(new)
+            old.close()
+            new.close()
+            with open_ledger(copy) as ledger:
+                yield ledger
+        return
+    with ledger:
+        yield ledger
+
+
+@contextmanager
+def _new_file(path: Path) -> Iterator[Ledger]:
+    """Open a new ledger that is put in place of a file once it is whole."""
+    if path.exists():
+        try:
+            check_file(path)
+        except AmbidError:
+            raise AmbidError(f"{path} exists, and is not a ledger of ambid. Give another file") from None
+    log = Path(f"{path}-wal")
+    if log.exists() and log.stat().st_size:
+        raise AmbidError(f"{path} is a ledger that a program has open. Give another file")
+    partial = path.with_name(f"{path.name}.partial")
+    files = [partial, *(Path(f"{partial}{ending}") for ending in ("-wal", "-shm", "-journal"))]
+    try:
+        for file in files:
+            file.unlink(missing_ok=True)  # of one that was killed
+        with open_ledger(partial) as ledger:
+            yield ledger
+        partial.replace(path)
+    except OSError as failure:
+        raise AmbidError(f"{path} cannot be written: {failure.strerror or failure}. Give another file") from None
+    finally:
+        for file in files:
+            file.unlink(missing_ok=True)
 
 
 SCHEMA = "ambid.fleet/1"

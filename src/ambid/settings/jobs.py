@@ -17,6 +17,13 @@ def declare(name: str, settings: str, **differences: Mapping[str, Any]) -> Job:
     return Job(name, tuple(replace(_TABLE[key], **differences.get(key, {})) for key in settings.split()))
 
 
+_LEDGER: Mapping[str, Any] = {
+    "help": "The ledger: file of SQLite, or URL of PostgreSQL.",
+    "metavar": "LEDGER",
+    "argument": True,
+    "required": True,
+}
+
 _JOBS = (
     declare(
         "identify",
@@ -137,6 +144,22 @@ _JOBS = (
             "help": "Write the ledger's tables as Parquet, for DuckDB or pandas.",
             "metavar": "FOLDER",
         },
+    ),
+    declare("ledger check", "ledger", ledger=_LEDGER),
+    declare("ledger backup", "ledger out", ledger=_LEDGER, out={"help": "Backup to write, a file of SQLite."}),
+    declare(
+        "ledger restore",
+        "ledger other out who why",
+        ledger=_LEDGER,
+        other={"help": "Backup, or another ledger.", "metavar": "BACKUP"},
+        out={"help": "Backup of what the ledger holds now.", "required": False},
+    ),
+    declare("ledger merge", "ledger other who why", ledger=_LEDGER),
+    declare(
+        "ledger retain",
+        "ledger older_than keep out who why",
+        ledger=_LEDGER,
+        out={"help": "Archive, a ledger that is made where there is none.", "kind": "text", "metavar": "FILE.db|URL"},
     ),
     declare(
         "design experiment",

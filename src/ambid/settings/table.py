@@ -203,6 +203,14 @@ SETTINGS = (
         "What the file leaves open, such as group=NAME or decimal=comma; repeatable.",
         many=True,
     ),
+    Setting(
+        "keep",
+        "text",
+        "",
+        "One usable estimate of each bearing and job stays from each of these; none: none stays.",
+        choices=("none", "day", "week", "month", "year"),
+        default="month",
+    ),
     Setting("ledger", "text", "FILE.db|URL", "Keep the result in this ledger: file of SQLite, or URL of PostgreSQL."),
     Setting("limit", "positive", "X", "Acceptable model error, relative to that at identification.", default=1.5),
     Setting("limit_s", "positive", "S", "Longest time for one record, in s.", default=600.0, long="time-limit"),
@@ -265,6 +273,8 @@ SETTINGS = (
         "all. Of a nonlinear structure its settings, such as ny=2,degree=3; 'ambid models' lists them.",
         default="auto",
     ),
+    Setting("older_than", "positive", "DAYS", "Of records taken longer ago than this.", required=True),
+    Setting("other", "text", "OTHER", "The other ledger: file or URL.", argument=True, required=True),
     Setting("out", "path", "FILE", "Record to write: .h5, .csv or .csv.gz.", required=True, short="o"),
     Setting("output", "text", "COL", "Output column; repeatable.", many=True),
     Setting(

@@ -1,0 +1,160 @@
+"""A ledger that is corrected, thinned, restored, merged and brought to a new version, and killed in the middle of it.
+
+``PYTHONPATH=. python bench/ledger_kills.py [KILLS]``: each is a process of its own, ended by SIGKILL at a random moment
+of the time that it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL. Afterwards the ledger must
+be as before or as undisturbed, and where it is as before, doing it again must end as undisturbed; its check must find
+nothing. Figures are printed.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from ambid.errors import AmbidError
+from ambid.ledger import open_ledger
+from ambid.ledger.entry import Note
+from tests.ledger import version1
+from tests.ledger.contents import contents
+from tests.ledger.entries import BEGIN, DAY, entry, parameter
+from tests.ledger.server import absent, new_database, server
+
+RECORDS, SEED = 400, 1
+DO = {
+    "rename": "l.rename('A', 'B')",
+    "redate": "l.redate('A', 5.0, record='day7.h5')",
+    "remove": "l.remove('A')",
+    "merge": "l.merge(other)",
+    "restore": "l.restore(other)",
+    "retain": f"l.retain(archive, before={BEGIN + RECORDS * DAY / 2}, keep='month')",
+    "migrate": "None",
+    "backup": "l.backup(archive)",
+}
+CHILD = """
+import sys
+from ambid.ledger import open_ledger
+place, other, archive = sys.argv[1:]
+open_ledger(archive + ".warm").close()
+if {early}:
+    print("begin", flush=True)
+with open_ledger(place) as l:
+    if not {early}:
+        print("begin", flush=True)
+    {do}
+"""
+
+
+def fill(place: str, names: str, first: int = 0) -> None:
+    """Fill a ledger: as many records of each name, with documents and events."""
+    numbers = tuple(parameter(name, 80.0, 0.5) for name in ("m", "k_x", "k_i", "R", "L"))
+    note = Note(at=BEGIN, kind="change", text="it fell", parameter="k_i")
+    with open_ledger(place) as ledger:
+        for name in names:
+            days = range(first, first + RECORDS)
+            ledger.add(
+                [entry(k, name, parameters=numbers, events=(note,), document="{}" + " " * 3000) for k in days]
+            )  # fmt: skip
+
+
+def facts(place: str) -> dict[str, Any]:
+    """Contents without what a repetition changes: who corrected when, and how often."""
+    found = contents(place)
+    found["correction"] = {row[2:4] for row in found["correction"]}
+    return found
+
+
+def child(what: str, place: str, other: str, archive: str) -> subprocess.Popen[str]:
+    code = CHILD.format(do=DO[what], early=what == "migrate")
+    return subprocess.Popen([sys.executable, "-c", code, place, other, archive], stdout=subprocess.PIPE, text=True)
+
+
+def begun(run: subprocess.Popen[str]) -> float:
+    assert run.stdout is not None
+    assert run.stdout.readline() == "begin\n"
+    return time.monotonic()
+
+
+class Trials:
+    """Ledgers of one engine to begin from, and what becomes of them."""
+
+    def __init__(self, folder: Path, url: str | None) -> None:
+        self.folder, self.url, self.n = folder, url, 0
+        self.other = str(folder / "other.db")
+        fill(self.other, "AC", RECORDS // 2)
+        for name, make in (("old", version1.make), ("full", lambda place: fill(place, "A"))):
+            make(str(folder / name) if url is None else new_database(url, name))
+
+    def new(self, what: str) -> tuple[str, str]:
+        """Make a ledger to begin from; its place and that of an archive."""
+        self.n += 1
+        archive, base = str(self.folder / f"{self.n}_archive.db"), "old" if what == "migrate" else "full"
+        if self.url is None:
+            return shutil.copy(self.folder / base, str(self.folder / f"{self.n}.db")), archive
+        import psycopg
+
+        with psycopg.connect(self.url.format("postgres"), autocommit=True) as c:
+            c.execute(f"CREATE DATABASE k{self.n} TEMPLATE {base}")
+        return self.url.format(f"k{self.n}"), archive
+
+    def measure(self, what: str, kills: int) -> str:
+        place, archive = self.new(what)
+        before = None if what == "migrate" else facts(place)
+        run = child(what, place, self.other, archive)
+        begin = begun(run)
+        assert run.wait() == 0
+        taken, after = time.monotonic() - begin, facts(place)
+        copy = facts(archive) if what in ("retain", "backup") else None
+        ends, wrong = Counter[str](), 0
+        for _ in range(kills):
+            place, archive = self.new(what)
+            run = child(what, place, self.other, archive)
+            begun(run)
+            time.sleep(DRAW.uniform(0.0, taken))
+            run.send_signal(signal.SIGKILL)
+            ends["ended before" if run.wait() == 0 else "killed"] += 1
+            state = self.state(what, place, before, after)
+            ends[state] += 1
+            if state == "as before":
+                child(what, place, self.other, archive).communicate()
+            with open_ledger(place) as ledger:
+                sound = not ledger.check() and facts(place) == after
+            wrong += not (sound and (copy is None or facts(archive) == copy))
+        counts = ", ".join(f"{n} {word}" for word, n in sorted(ends.items()))
+        return f"{what:8s} {1e3 * taken:6.0f} ms undisturbed; {kills} kills: {counts}; {wrong} wrong"
+
+    def state(self, what: str, place: str, before: Any, after: Any) -> str:
+        """Say how a killed one left the ledger."""
+        try:
+            now = facts(place)
+        except AmbidError as refusal:
+            return "as before" if what == "migrate" and "is of version 1" in str(refusal) else "neither"
+        return "as before" if now == before else "as undisturbed" if now == after else "neither"
+
+
+DRAW = random.Random(SEED)
+
+
+def main(kills: int = 20) -> None:
+    with tempfile.TemporaryDirectory() as made:
+        of_files = Trials(Path(made), None)
+        for what in DO:
+            print(f"SQLite      {of_files.measure(what, kills)}", flush=True)
+    if why := absent():
+        print(f"PostgreSQL left out: {why}")
+        return
+    with tempfile.TemporaryDirectory() as made, server() as url:
+        of_server = Trials(Path(made), url)
+        for what in DO:
+            print(f"PostgreSQL  {of_server.measure(what, kills)}", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
