@@ -1,9 +1,9 @@
 """A ledger that is corrected, thinned, restored, merged and brought to a new version, and killed in the middle of it.
 
-``PYTHONPATH=. python bench/ledger_kills.py [KILLS]``: each is a process of its own, ended by SIGKILL at a random moment
-of the time that it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL. Afterwards the ledger must
-be as before or as undisturbed, and where it is as before, doing it again must end as undisturbed; its check must find
-nothing. Figures are printed.
+``PYTHONPATH=. python bench/ledger_kills.py [KILLS [ENGINES]]``: each is a process of its own, ended by SIGKILL at a
+random moment of the time that it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL. Afterwards
+the ledger must be as before or as undisturbed; where it is as before, doing it again must end as undisturbed; its check
+must find nothing. Figures are printed.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -142,19 +143,17 @@ class Trials:
 DRAW = random.Random(SEED)
 
 
-def main(kills: int = 20) -> None:
-    with tempfile.TemporaryDirectory() as made:
-        of_files = Trials(Path(made), None)
-        for what in DO:
-            print(f"SQLite      {of_files.measure(what, kills)}", flush=True)
-    if why := absent():
-        print(f"PostgreSQL left out: {why}")
-        return
-    with tempfile.TemporaryDirectory() as made, server() as url:
-        of_server = Trials(Path(made), url)
-        for what in DO:
-            print(f"PostgreSQL  {of_server.measure(what, kills)}", flush=True)
+def main(kills: str = "20", engines: str = "SQLite,PostgreSQL") -> None:
+    for engine in engines.split(","):
+        why = absent() if engine == "PostgreSQL" else None
+        if why is not None:
+            print(f"{engine} left out: {why}")
+            continue
+        with tempfile.TemporaryDirectory() as folder, server() if engine == "PostgreSQL" else nullcontext() as url:
+            trials = Trials(Path(folder), url)
+            for what in DO:
+                print(f"{engine:10s}  {trials.measure(what, int(kills))}", flush=True)
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(*sys.argv[1:])

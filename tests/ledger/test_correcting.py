@@ -1,5 +1,9 @@
 """Corrections: names and times mended, records removed, what was before kept, undone, and held for later estimates."""
 
+import signal
+import subprocess
+import sys
+
 import pytest
 
 from ambid.errors import AmbidError
@@ -157,3 +161,30 @@ def test_records_of_one_name_are_told_apart_by_their_digits(tmp_path):
         with pytest.raises(AmbidError, match="2 records of 'A' have that name: 0abcdef0123 of 2026-01-01"):
             ledger.remove("A", record="day.h5")
         assert ledger.remove("A", record="1abcde").text == "1 estimate of 1 record of 'A' removed"
+
+
+KILLED = """
+import sys
+from ambid.ledger import copying, correcting, open_ledger
+halt = lambda *_, **__: print("half", flush=True) or sys.stdin.read()
+correcting._follow = correcting.note = halt
+with open_ledger(sys.argv[1]) as ledger:
+    {}
+"""
+
+
+@pytest.mark.parametrize("do", ["ledger.remove('pmup 1')", "ledger.restore(sys.argv[2])"])
+def test_one_killed_in_the_middle_leaves_all_as_before(ledger, place, tmp_path, do):
+    ledger.backup(tmp_path / "b.db")
+    ledger.rename("pump 1", "pump 2")
+    before = contents(ledger)
+    run = subprocess.Popen(
+        [sys.executable, "-c", KILLED.format(do), place, str(tmp_path / "b.db")], stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert run.stdout.readline() == "half\n"
+    assert contents(ledger) == before  # while it is at work
+    run.send_signal(signal.SIGKILL)
+    run.communicate()
+    assert (contents(ledger), len(ledger.corrections()), ledger.check()) == (before, 1, ())
+    ledger.remove("pmup 1")
