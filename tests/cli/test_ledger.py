@@ -5,6 +5,7 @@ import sqlite3
 import pytest
 
 from ambid.ledger import open_ledger
+from tests.ledger import version1
 from tests.ledger.contents import contents
 from tests.ledger.entries import entry
 
@@ -73,3 +74,19 @@ def test_another_ledger_that_is_not_there_leaves_no_new_one(here, ambid, verb):
     done = ambid("ledger", verb, "new.db", "none.db")
     assert (done.code, "none.db does not exist" in done.err) == (2, True)
     assert sorted(p.name for p in here.glob("*.db")) == ["l.db"]
+
+
+def test_an_older_ledger_is_read_once_it_is_checked_and_one_of_no_version_is_refused(here, ambid):
+    version1.make("old.db")
+    refused = ambid("history", "A", "--ledger", "old.db")
+    assert (refused.code, "'ambid ledger check' brings it to that version" in refused.err) == (2, True)
+    assert ambid("ledger", "check", "old.db").out == "old.db is whole\n"
+    assert ambid("history", "A", "--ledger", "old.db").code == 0
+    for version in ("abc", "0"):
+        c = sqlite3.connect("old.db")
+        c.execute(f"UPDATE meta SET value = '{version}' WHERE name = 'version'")
+        c.commit()
+        c.close()
+        refused = ambid("history", "A", "--ledger", "old.db")
+        said = f"ambid: ledger old.db says that its version is '{version}'; it must be a number from 1 to 2."
+        assert (refused.code, refused.err) == (2, f"{said} Restore it from a backup\n")

@@ -1,5 +1,7 @@
 """A bearing over time: what is shown of it, and that what nobody saw is never a number."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -146,3 +148,13 @@ def test_of_several_by_one_version_the_latest_counts(tmp_path, monkeypatch):
             monkeypatch.setattr("time.time", lambda at=at: at)
             ledger.add([entry(0, rig=rig)])
         assert [e.rig_sha for e in ledger.history("A").estimates] == ["first"]
+
+
+def test_a_file_of_a_history_without_what_came_later_is_read(tmp_path, history):
+    document = json.loads(presentation.document(history))
+    for name in ("left_out", "corrections"):
+        del document[name]
+    for e in document["estimates"]:
+        del e["superseded"]
+    (tmp_path / "h.json").write_text(json.dumps(document))
+    assert ambid.load(tmp_path / "h.json").estimates == history.estimates

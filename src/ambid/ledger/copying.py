@@ -89,7 +89,8 @@ def copy(source: Connection, c: Connection, only: Collection[str] | None = None)
     for name in ("failure", "silence", "correction") if only is None else ():
         columns = [x for x in t[name].c if x.name != "id"]
         there = {tuple(row) for row in c.execute(select(*columns))}
-        rows = [row for row in source.execute(select(*columns)) if tuple(row) not in there]
+        query = select(*columns).order_by(*t[name].primary_key)
+        rows = [row for row in source.execute(query) if tuple(row) not in there]
         insert_new(c, t[name], [dict(row._mapping) for row in rows])
     wanted = None if only is None else frozenset(only)
     bearings = source.execute(select(t["bearing"]).order_by(t["bearing"].c.name)).all()
