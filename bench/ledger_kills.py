@@ -1,9 +1,9 @@
 """A ledger that is corrected, thinned, restored, merged and brought to a new version, and killed in the middle of it.
 
-``PYTHONPATH=. python bench/ledger_kills.py [KILLS [ENGINES]]``: each is a process of its own, ended by SIGKILL at a
-random moment of the time that it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL. Afterwards
-the ledger must be as before or as undisturbed; where it is as before, doing it again must end as undisturbed; its check
-must find nothing. Figures are printed.
+``PYTHONPATH=. python bench/ledger_kills.py [KILLS [ENGINES [WHAT...]]]``: each is a process of its own, which SIGKILL
+ends at a random moment of the time that it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL. The
+ledger must then be as before or as undisturbed; where it is as before, doing it again must end as undisturbed.
+Its check must find nothing. Figures are printed.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Trials:
 DRAW = random.Random(SEED)
 
 
-def main(kills: str = "20", engines: str = "SQLite,PostgreSQL") -> None:
+def main(kills: str = "20", engines: str = "SQLite,PostgreSQL", *what: str) -> None:
     for engine in engines.split(","):
         why = absent() if engine == "PostgreSQL" else None
         if why is not None:
@@ -151,8 +151,8 @@ def main(kills: str = "20", engines: str = "SQLite,PostgreSQL") -> None:
             continue
         with tempfile.TemporaryDirectory() as folder, server() if engine == "PostgreSQL" else nullcontext() as url:
             trials = Trials(Path(folder), url)
-            for what in DO:
-                print(f"{engine:10s}  {trials.measure(what, int(kills))}", flush=True)
+            for one in what or DO:
+                print(f"{engine:10s}  {trials.measure(one, int(kills))}", flush=True)
 
 
 if __name__ == "__main__":

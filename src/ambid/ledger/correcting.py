@@ -68,7 +68,7 @@ def redate(c: Connection, ledger: str, bearing: str, taken_at: float, record: st
     if len({e.sha for e in own}) > 1:
         raise AmbidError(
             f"{bearing!r} has {counted(len({e.sha for e in own}), 'record')}, and a time is that of one. Give "
-            f"{setting('of_record', 'NAME')}"
+            f"{setting('record', 'NAME')}"
         )
     if all(e.taken_at == taken_at for e in own):
         raise AmbidError(f"the record of {bearing!r} has that time already. Give another")
