@@ -131,6 +131,8 @@ def test_a_ledger_is_corrected_and_says_how_that_is_undone(demo, ambid, monkeypa
     assert "2 estimates of 2 records of" not in ambid("history", "pump 1", *of, "--remove", "--record", "day1.h5").out
     shown = ambid("history", "pump 1", *of).out
     assert ("2 estimates, 2026-01-01" in shown, "by anna: misspelt" in " ".join(shown.split())) == (True, True)
+    listing = ambid("history", *of).out.split("corrections\n")[1]
+    assert [line.split()[0] for line in listing.splitlines()] == ["1", "2", "3"]
     assert ambid("history", *of, "--undo", "3").code == 0
     assert "3 estimates" in ambid("history", "pump 1", *of).out
 

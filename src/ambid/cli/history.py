@@ -96,7 +96,8 @@ def command(v: Values) -> None:
                 for broker in (x for x in v.publish or () if not x.endswith(METRICS_ENDINGS)):
                     typer.echo(f"{counted(publish(watched, broker), 'message')} sent to {broker}", err=True)
             elif v.bearing is None:
-                typer.echo(bearings_text(found.bearings(), found.failures().values(), paint=painter()))
+                known = found.bearings(), found.failures().values(), found.corrections()
+                typer.echo(bearings_text(*known, paint=painter()))
                 return
             else:
                 result = found.history(v.bearing, every=v.every)

@@ -16,7 +16,7 @@ from ambid.arrays import Array
 from ambid.control.zones import Zone
 from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95
-from ambid.ledger.entry import Note, day
+from ambid.ledger.entry import Correction, Note, day
 from ambid.ledger.history import History, Series
 from ambid.ledger.monitor import Alarm, Trend, Watched
 from ambid.ledger.store import Failure, KnownBearing
@@ -88,10 +88,7 @@ def history_sections(history: History) -> list[Section]:
     for e in h.events[-_SHOWN:]:
         parameter = f"{e.parameter}: " if e.parameter else ""
         events.append([f"{day(e.at)}  {e.kind}  ", parameter + e.text])
-    corrected: list[Line] = [
-        [f"{c.number}  {day(c.at)}  ", f"{c.text}, by {c.who}" + (f": {c.why}" if c.why else "")]
-        for c in h.corrections[-_SHOWN:]
-    ]
+    corrected: list[Line] = [[head, text] for head, text in map(_correction, h.corrections[-_SHOWN:])]
     rest = len(h.events) - _SHOWN
     more = [f"{counted(rest, 'earlier event')} in {setting('json')}"] if rest > 0 else []
     return [
@@ -135,11 +132,18 @@ def _row(s: Series, n: int, zone: str) -> tuple[str, ...]:
     return s.name, latest + zone, day(float(s.taken_at[z])), change, count
 
 
-def bearings_text(bearings: Sequence[KnownBearing], failures: Iterable[Failure], *, paint: Paint = plain) -> str:
-    """Write what a ledger holds: its bearings, and the records that gave no estimate."""
+def _correction(c: Correction) -> tuple[str, str]:
+    return f"{c.number}  {day(c.at)}  ", f"{c.text}, by {c.who}" + (f": {c.why}" if c.why else "")
+
+
+def bearings_text(
+    bearings: Sequence[KnownBearing], failures: Iterable[Failure], corrections: Sequence[Correction] = (), *,
+    paint: Paint = plain,
+) -> str:  # fmt: skip
+    """Write what a ledger holds: its bearings, the records that gave no estimate, and what was corrected last."""
     rows = [("bearing", "rig", "estimates", "first", "last")]
     rows += [(b.name, b.plant, str(b.estimates), day(b.first), day(b.last)) for b in bearings]
-    failed = list(failures)
+    failed, last = list(failures), corrections[-_SHOWN:]
     lines = [f"{f.record or f.sha[:12]} ({f.bearing}): {f.reason}" for f in failed[:_SHOWN]]
     rest = len(failed) - _SHOWN
     title = paint(f"{counted(len(failed), 'record')} without an estimate", "strong")
@@ -147,6 +151,7 @@ def bearings_text(bearings: Sequence[KnownBearing], failures: Iterable[Failure],
         [
             columns(rows, right=(2,)) if bearings else ["no estimates yet"],
             [title, *lines, *([f"… and {rest} more"] if rest > 0 else [])] if failed else [],
+            [paint("corrections", "strong"), *map("".join, map(_correction, last))] if last else [],
         ]
     )
 
