@@ -1,8 +1,8 @@
 """A ledger that is corrected, thinned, restored, merged and brought to a new version, and killed in the middle of it.
 
 ``PYTHONPATH=. python bench/ledger_kills.py [KILLS [ENGINES [WHAT...]]]``: each is a process of its own, which SIGKILL
-ends at a random moment of 1.2 times what it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL. The
-ledger must then be as before or as undisturbed; where it is as before, doing it again must end as undisturbed.
+ends at a random moment of 1.2 times what it takes undisturbed, in SQLite and, where its programs are, in PostgreSQL.
+The ledger must then be as before or as undisturbed; where it is as before, doing it again must end as undisturbed.
 Its check must find nothing. Figures are printed.
 """
 
