@@ -13,7 +13,8 @@ import numpy as np
 from ambid.ledger import History, Series, watch
 from ambid.ledger.entry import Note
 from ambid.ledger.history import KnownEstimate
-from ambid.ledger.monitor import BUILT_IN, MONTH_S
+from ambid.ledger.rules import BUILT_IN
+from ambid.ledger.trends import MONTH_S
 
 BEGIN, YEARS, EVERY_S = 1767225600.0, 3.0, 3 * 86400.0
 SD = {"m": 0.002, "k_x": 0.005, "k_i": 0.003, "R": 0.001, "L": 0.003}

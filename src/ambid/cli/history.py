@@ -65,7 +65,7 @@ def command(v: Values) -> None:
     if _corrected(v):
         return
     from ambid.ledger import open_ledger, read_rules, watch
-    from ambid.ledger.monitor import BUILT_IN
+    from ambid.ledger.rules import BUILT_IN
     from ambid.ledger.telling import publish, write_metrics
     from ambid.report.history import bearings_text
 

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from ambid.ledger.history import History as History
     from ambid.ledger.history import Series as Series
     from ambid.ledger.monitor import Alarm as Alarm
-    from ambid.ledger.monitor import Rule as Rule
-    from ambid.ledger.monitor import Trend as Trend
     from ambid.ledger.monitor import Watched as Watched
-    from ambid.ledger.monitor import read_rules as read_rules
     from ambid.ledger.monitor import watch as watch
+    from ambid.ledger.rules import Rule as Rule
+    from ambid.ledger.rules import read_rules as read_rules
     from ambid.ledger.store import FleetRun as FleetRun
     from ambid.ledger.store import Ledger as Ledger
     from ambid.ledger.store import open_ledger as open_ledger
     from ambid.ledger.telling import publish as publish
     from ambid.ledger.telling import write_metrics as write_metrics
+    from ambid.ledger.trends import Trend as Trend
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 
 from ambid.ledger.history import History, KnownEstimate
-from ambid.ledger.monitor import BUILT_IN, Alarm, Rule, watch
+from ambid.ledger.monitor import Alarm, watch
+from ambid.ledger.rules import BUILT_IN, Rule
 
 _LATE = 3.0  # usual times between two estimates after which the last usable one is stale
 _DAY_S = 86400.0

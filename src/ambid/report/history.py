@@ -18,8 +18,9 @@ from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95
 from ambid.ledger.entry import Correction, Note, day
 from ambid.ledger.history import History, Series
-from ambid.ledger.monitor import Alarm, Trend, Watched
+from ambid.ledger.monitor import Alarm, Watched
 from ambid.ledger.store import Failure, KnownBearing
+from ambid.ledger.trends import Trend
 from ambid.report.document import Document, Frame, Lines, Section, grid
 from ambid.report.drawing import (
     BAND,
