@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,13 +15,15 @@ from ambid.arrays import Array
 from ambid.estimation.result import NORMAL_95
 from ambid.ledger.history import History, Series
 from ambid.ledger.rules import Rule
+from ambid.ledger.wander import beyond_wander
 
 MONTH_S = 365.25 / 12 * 86400.0
 FEW = 3  # values below which nothing is compared
 WINDOW = 5  # values whose median is a level
 _FAR = 5.0  # standard deviations of the first level from zero, from which changes are relative to it
 _BAI = 11.0  # 95 % of the date's error in samples, times (step / spread)^2
-_PLAIN = 25.0  # chi-squared above chance from which a trend is told: slow wander looks like small ones
+_PLAIN = 25.0  # chi-squared above that of a level from which a trend is looked at
+_BEYOND = {"line": 15.0, "bend": 19.0, "step": 22.0}  # of `beyond_wander`, by trend: dates are chosen among many
 _STEEP = 8.0  # standard deviations of a slope that fixes the date of a drift
 
 
@@ -138,6 +140,12 @@ class _Fits:
         count = {"level": 1, "line": 2, "bend": 4, "step": 4}  # their dates are chosen among many
         return min(kinds, key=lambda k: self.chi[k] / self.scale + count[k] * math.log(self.y.size))
 
+    def course(self, kind: str) -> Array:
+        """Return the shape of a change, without its size."""
+        return {"line": self.x, "bend": np.maximum(self.x - self.bend, 0.0)}.get(
+            kind, (np.arange(self.x.size) >= self.after).astype(float)
+        )
+
 
 def _fits(v: Values) -> _Fits:
     base, _ = first_level(v)
@@ -153,9 +161,9 @@ def _fits(v: Values) -> _Fits:
     inner = split[1:-1] if split.size > 2 else split
     after = int(np.argmin(inner)) + (2 if split.size > 2 else 1)
     bends = np.unique(np.quantile(x, np.linspace(0.02, 0.9, 60)))
-    chis = [_line(np.maximum(x - b, 0.0), y, w)[2] for b in bends]
+    chis = _bent(np.maximum(x - bends[:, None], 0.0), y, w)
     chi = {
-        "level": float(Q[-1] - Y[-1] ** 2 / W[-1]), "line": _line(x, y, w)[2], "bend": min(chis),
+        "level": float(Q[-1] - Y[-1] ** 2 / W[-1]), "line": _line(x, y, w)[2], "bend": float(np.min(chis)),
         "step": float(np.min(inner)),
     }  # fmt: skip
     bend = float(bends[int(np.argmin(chis))])
@@ -168,6 +176,15 @@ def _fits(v: Values) -> _Fits:
     follow = min(max(float(e[1:] @ e[:-1] / (e @ e)), 0.0), 0.95) if e @ e > 0 else 0.0
     scale = max(1.0, float(e @ e) / max(e.size - 3, 1)) * (1.0 + follow) / (1.0 - follow)
     return _Fits(x=x, y=y, w=w, chi=chi, after=after, bend=bend, scale=scale)
+
+
+def _bent(x: Array, y: Array, w: Array) -> Array:
+    """Return chi-squared of lines through many courses, each a row of `x`."""
+    total = w.sum()
+    x = x - (x @ w / total)[:, None]
+    own, with_y = x**2 @ w, x @ (w * (y - (w @ y) / total))
+    level = float(w @ (y - (w @ y) / total) ** 2)
+    return np.asarray(level - np.divide(with_y**2, own, out=np.zeros_like(own), where=own > 0.0), dtype=float)
 
 
 def _line(x: Array, y: Array, w: Array) -> tuple[Array, Array, float]:
@@ -226,8 +243,12 @@ def trend_of(h: History, s: Series, rules: Sequence[Rule]) -> Iterable[Trend]:
     if not comparable(v):
         return
     f = _fits(v)
-    kind = f.best("level", "line", "bend", "step")
-    if f.chi["level"] - f.chi[kind] < _PLAIN * f.scale:
+    kind = f.best("line", "bend", "step")
+    beyond = 0.0
+    if f.chi["level"] - f.chi[kind] > _PLAIN:
+        beyond, scale = beyond_wander(f.x, f.y, f.w, f.course(kind))
+        f = replace(f, scale=scale)
+    if beyond < _BEYOND[kind]:
         kind = "level"
     about: dict[str, Any] = {"bearing": h.bearing, "parameter": s.name, "unit": s.unit, "values": int(v.t.size)}
     if kind == "step":
