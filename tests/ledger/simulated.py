@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.ledger import History, Series, watch
+from ambid.ledger.alarm import KINDS
 from ambid.ledger.entry import Note
 from ambid.ledger.history import KnownEstimate
-from ambid.ledger.rules import BUILT_IN
 from ambid.ledger.trends import MONTH_S
 
 BEGIN, YEARS, EVERY_S = 1767225600.0, 3.0, 3 * 86400.0
@@ -78,6 +78,36 @@ def bearing(name: str, fault: str, rng: np.random.Generator, every_s: float = EV
     return Bearing(fault, truths, history)
 
 
+def wandering(name: str, t: np.ndarray, rng: np.random.Generator) -> History:
+    """Return a sound bearing: noise, of half of them wander that follows itself by 0.9, seasons of R, outliers,
+    estimates that are not usable, or with caution; numbers of its own.
+    """
+    n, wander = t.size, float(rng.random() < 0.5)
+    usable = rng.random(n) > rng.choice([0.0, 0.02, 0.1])
+    season = 0.02 * np.sin(2 * np.pi * (t - BEGIN) / (12 * MONTH_S) + rng.uniform(0, 2 * np.pi))
+    series = {}
+    for parameter, share in SD.items():
+        sd = share * rng.uniform(0.5, 2.0) * rng.uniform(0.7, 1.4, n)
+        e, slow = rng.standard_normal(n), rng.standard_normal(n)
+        slow[1:] *= np.sqrt(1.0 - 0.9**2)
+        for k in range(1, n):
+            slow[k] += 0.9 * slow[k - 1]
+        relative = rng.uniform(1.0, 2.0) * sd * e + wander * share * slow + 5.0 * sd * (rng.random(n) < 0.01)
+        level = VALUE[parameter] * (1.0 + 0.05 * rng.standard_normal())
+        truth = level * (1.0 + season if parameter == "R" else np.ones(n))
+        value = np.where(usable & (rng.random(n) > 0.05 * (parameter == "k_x")), truth * (1.0 + relative), np.nan)
+        series[parameter] = Series(
+            name=parameter, unit="", taken_at=t, value=value, sd=abs(level) * np.where(np.isfinite(value), sd, np.nan),
+            identifiable=np.isfinite(value) | ~usable, estimate=np.arange(n), role="free",
+        )  # fmt: skip
+    words = np.where(usable, np.where(rng.random(n) < 0.05, "caution", "usable"), "unusable")
+    estimates = tuple(
+        KnownEstimate(float(x), f"{k}.h5", f"{name} {k}", name, "identify", "one-axis", "1", "converged", str(w), "")
+        for k, (x, w) in enumerate(zip(t, words, strict=True))
+    )
+    return History(bearing=name, plant=name, ledger="", estimates=estimates, series=series)
+
+
 @dataclass
 class Score:
     """What became of a fleet."""
@@ -91,13 +121,16 @@ class Score:
 
 
 def judge(fleet: list[Bearing]) -> Score:
-    score, watched = Score(), watch(b.history for b in fleet)
+    end = max(b.history.estimates[-1].taken_at for b in fleet)
+    score, watched = Score(), watch((b.history for b in fleet), now=end)
+    records = [a for a in watched.alarms if a.kind in KINDS]  # nothing is wrong with them
+    score.false, score.wrong = len(records), tuple(f"false: {a}" for a in records)
     for b in fleet:
         _, cause = FAULTS[b.fault]
         t = b.history.estimates
         for parameter in SD:
             change = b.truth[parameter] / np.median(b.truth[parameter][:5]) - 1.0
-            for rule in (r for r in BUILT_IN if r.parameter == parameter):
+            for rule in (r for r in watched.rules if r.parameter == parameter):
                 reach = change / rule.change  # 1: at the limit
                 alarms = [
                     a for a in watched.alarms

@@ -11,10 +11,12 @@ import pytest
 
 import ambid
 from ambid.errors import AmbidError
-from ambid.ledger import Rule, open_ledger, publish, read_rules, watch, write_metrics
+from ambid.ledger import RecordRule, Rule, open_ledger, publish, read_rules, watch, write_metrics
 from tests.ledger.entries import BEGIN, DAY, entry, parameter
-from tests.ledger.simulated import MONTH_S, bearing, fleet, judge
+from tests.ledger.simulated import BEGIN as START
+from tests.ledger.simulated import MONTH_S, YEARS, bearing, fleet, judge
 
+END = START + YEARS * 12 * MONTH_S
 MOSQUITTO = Path("/usr/sbin/mosquitto")
 
 
@@ -25,7 +27,7 @@ def bearings():
 
 @pytest.fixture(scope="module")
 def watched(bearings):
-    return watch(b.history for b in bearings)
+    return watch((b.history for b in bearings), now=bearings[0].history.estimates[-1].taken_at)
 
 
 def test_faults_are_found_with_cause_and_date_and_nothing_else(bearings):
@@ -40,11 +42,13 @@ def test_what_is_not_usable_raises_and_clears_nothing(bearings):
         return replace(h, series={n: replace(s, value=np.where(bad, np.nan, s.value)) for n, s in h.series.items()})
 
     aged = next(b for b in bearings if b.fault == "ageing magnet").history
-    (alarm, *_) = watch([aged]).alarms
+    (alarm, *_) = watch([aged], now=END).alarms
     bad = np.array([e.taken_at >= alarm.at_from - 60 * DAY for e in aged.estimates])
-    assert not watch([without(aged, bad)]).alarms  # all that would raise it is not usable
+    unseen = watch([without(aged, bad)], now=END).alarms  # all that would raise it is not usable
+    assert {a.kind for a in unseen} == {"unseen"}
     bad = np.array([e.taken_at > alarm.raised for e in aged.estimates])
-    assert [a.cleared for a in watch([without(aged, bad)]).alarms if a.parameter == alarm.parameter] == [None]
+    standing = [a for a in watch([without(aged, bad)], now=END).alarms if a.rule == alarm.rule]
+    assert [a.cleared for a in standing] == [None]
 
 
 def test_an_alarm_is_cleared_where_the_level_comes_back():
@@ -52,12 +56,12 @@ def test_an_alarm_is_cleared_where_the_level_comes_back():
     s = h.series["k_i"]
     low = (s.taken_at > h.estimates[120].taken_at) & (s.taken_at < h.estimates[200].taken_at)
     h = replace(h, series={**h.series, "k_i": replace(s, value=np.where(low, 0.85 * s.value, s.value))})
-    (alarm,) = watch([h]).alarms
+    (alarm,) = watch([h], now=END).alarms
     assert (alarm.parameter, alarm.kind) == ("k_i", "step")
     assert alarm.at_from <= h.estimates[121].taken_at <= alarm.at_to
     assert h.estimates[200].taken_at < alarm.cleared < h.estimates[210].taken_at
     assert "not clear" in alarm.cause  # no single fault moves k_i alone
-    assert watch([h]).passed
+    assert watch([h], now=END).passed
 
 
 def test_with_a_held_mass_a_sensor_moves_what_the_record_shows():
@@ -86,7 +90,7 @@ def test_what_is_near_zero_has_no_relative_change():
     h = bearing("B", "", np.random.default_rng(5)).history
     s = h.series["L"]
     offset = replace(s, value=s.value - np.nanmean(s.value))
-    found = watch([replace(h, series={"L": offset})])
+    found = watch([replace(h, series={"L": offset})], now=END)
     assert (found.alarms, found.trends) == ((), ())
 
 
@@ -117,7 +121,7 @@ def test_results_are_told_and_come_back_from_their_file(watched, tmp_path):
     watched.save(tmp_path / "a.json")
     again = ambid.load(tmp_path / "a.json")
     assert again.alarms == watched.alarms
-    assert again.rules == watched.rules
+    assert (again.rules, again.records, again.states) == (watched.rules, watched.records, watched.states)
     assert len(watched.to_dataframe()) == len(watched.alarms)
     assert len(watched.plot().axes) > len(again.plot().axes) == 1
 
@@ -125,7 +129,7 @@ def test_results_are_told_and_come_back_from_their_file(watched, tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("alarm = 3", "must hold tables [[alarm]]"),
+        ("alarm = 3", "must hold tables [[alarm]] and [[records]]"),
         ("[[alarms]]\nparameter = 'k_i'", "Did you mean 'alarm'?"),
         ("[[alarm]]\nparameter = 'k_i'\nchange = '5 %'", "must be signed and in percent"),
         ("[[alarm]]\nparameter = 'k_i'\nchange = -0.05", "must be signed and in percent"),
@@ -149,7 +153,8 @@ def test_rules_are_read_and_name_what_is_there(tmp_path, bearings):
         "[[alarm]]\nparameter = 'k_i'\nchange = '-5 %'\nsince = 2026-03-01\n[[alarm]]\nparameter='R'\nchange='+10%'\n"
     )
     (tmp_path / "r.toml").write_text(text)
-    a, b = read_rules(tmp_path / "r.toml")
+    a, b, records = read_rules(tmp_path / "r.toml")
+    assert records == RecordRule()
     assert (a.change, a.since, b.change, b.since) == (-0.05, 1772323200.0, 0.1, "start")
     assert [str(a), str(b)] == ["k_i -5 % since 2026-03-01T00:00", "R +10 %"]
     with pytest.raises(AmbidError, match="no bearing has a parameter 'k_y'"):
@@ -162,7 +167,7 @@ def test_metrics_are_those_of_prometheus(watched, tmp_path):
     families = parser.text_string_to_metric_families((tmp_path / "a.prom").read_text())
     found = {f.name: f.samples for f in families}
     assert len(found["ambid_parameter"]) == 5 * len(watched.bearings)
-    assert sum(x.value for x in found["ambid_alarm"]) == len(watched.standing)
+    assert sum(x.value for x in found["ambid_alarm"]) == len(watched.open)
 
 
 @pytest.mark.skipif(not MOSQUITTO.exists(), reason="Debian's package mosquitto, a broker, is not installed")

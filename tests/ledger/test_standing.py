@@ -12,22 +12,22 @@ from tests.ledger.entries import BEGIN, DAY, entry, parameter
 def standing(tmp_path, entries):
     with open_ledger(tmp_path / "works.db") as ledger:
         ledger.add(entries)
-        return standing_of(ledger.history("A"))
+        return standing_of(ledger.history("A"), now=max(e.taken_at for e in entries))
 
 
 def test_a_bearing_that_is_looked_at_every_day_is_stale_after_three(tmp_path):
-    found = standing(tmp_path, [entry(k) for k in range(5)])
-    last = BEGIN + 4 * DAY
-    assert (found.estimates, found.stale_after_s) == (5, 3 * DAY)
+    found = standing(tmp_path, [entry(k) for k in range(10)])
+    last = BEGIN + 9 * DAY
+    assert (found.estimates, found.stale_after_s) == (10, 3.5 * DAY)
     assert found.age_s(last + 3600.0) == 3600.0
     assert found.state(last + 2 * DAY) == "good"
     assert found.state(last + 4 * DAY) == "stale"
 
 
-def test_a_single_estimate_is_stale_after_a_month(tmp_path):
+def test_a_single_estimate_is_stale_after_three_months(tmp_path):
     found = standing(tmp_path, [entry()])
-    assert found.state(BEGIN + 29 * DAY) == "good"
-    assert found.state(BEGIN + 31 * DAY) == "stale"
+    assert found.state(BEGIN + 91 * DAY) == "good"
+    assert found.state(BEGIN + 93 * DAY) == "stale"
 
 
 @pytest.mark.parametrize(

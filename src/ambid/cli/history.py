@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import typer
@@ -26,14 +27,14 @@ def _corrected(v: Values) -> bool:
 
     changes = [name for name in _CHANGES if v[name] not in (None, False)]
     if not changes:
-        refuse_given(
-            v.only("record who why"), f"{{}} is for {', '.join(map(setting, _CHANGES))}. Give one, or omit {{}}"
-        )
+        unused = v.only("record who why" if v.acknowledge is None else "record")
+        refuse_given(unused, f"{{}} is for {', '.join(map(setting, _CHANGES))}. Give one, or omit {{}}")
         return False
     if len(changes) > 1:
         raise AmbidError(f"{' and '.join(map(setting, changes))} are {len(changes)} changes. Make them one by one")
     change = changes[0]
-    refuse_given(v.only("every export alarms publish json plot report strict"), f"{{}} is not for {setting(change)}")
+    shown = "every export alarms acknowledge until publish json plot report strict"
+    refuse_given(v.only(shown), f"{{}} is not for {setting(change)}")
     if change == "undo":
         refuse_given(v.only("bearing record"), "--undo takes a number alone. Omit {}")
     elif v.bearing is None:
@@ -57,15 +58,18 @@ def command(v: Values) -> None:
     """Show a bearing over time: its parameters with bands, verdicts, events, changes of the rig.
 
     What no record showed is a gap and never a number. Without BEARING the bearings of the ledger are listed, and the
-    records that gave no estimate. With --alarms and --strict the exit code is 3 where an alarm stands.
+    records that gave no estimate. With --alarms and --strict the exit code is 3 where an alarm stands that nobody has
+    acknowledged or silenced.
 
     --rename, --redate and --remove correct the bearing, or one --record of it, and tell how that is undone. They hold
     for later estimates of the same records too.
     """
     if _corrected(v):
         return
-    from ambid.ledger import open_ledger, read_rules, watch
+    from ambid.ledger import Watched, open_ledger, read_rules, watch
+    from ambid.ledger.entry import moment
     from ambid.ledger.rules import BUILT_IN
+    from ambid.ledger.silences import silences, take_note
     from ambid.ledger.telling import publish, write_metrics
     from ambid.report.history import bearings_text
 
@@ -77,20 +81,37 @@ def command(v: Values) -> None:
             outputs.claim(path, "publish", METRICS_ENDINGS)
         rules = BUILT_IN if file is None else read_rules(file)
         if v.alarms is None:
-            refuse_given(v.only("publish"), "{} needs --alarms. Give it, or omit {}")
+            refuse_given(v.only("publish acknowledge"), "{} needs --alarms. Give it, or omit {}")
             if v.bearing is None and v.export is None:
                 refuse_given(v.only("every"), "{} is for one bearing, or for --tables. Name it, or omit {}")
         else:
             refuse_given(v.only("every"), "{} is not for --alarms. Omit {}")
+        if v.acknowledge is None:
+            refuse_given(v.only("until"), "{} needs --acknowledge. Give it, or omit {}")
+        elif v.bearing is None or not (v.why or "").strip():
+            raise AmbidError("--acknowledge needs the name of the BEARING, and --why. Give them")
+        until = None if v.until is None else moment(v.until, "until")
         if v.bearing is None and v.alarms is None:
             refuse_given(v.only("json plot report strict"), "{} is for one bearing. Name it, or omit {}")
-        with open_ledger(v.ledger, write=False) as found:
+        with open_ledger(v.ledger, write=v.acknowledge is not None, make=False) as found:
             if v.export is not None:
                 typer.echo(f"{v.export} holds {', '.join(found.export(v.export, every=v.every))}", err=True)
             result: Result
             if v.alarms is not None:
                 names = [b.name for b in found.bearings()] if v.bearing is None else [v.bearing]
-                result = watched = watch((found.history(name) for name in names), rules)
+                now = time.time()
+                failed = [f for f in found.failures().values() if v.bearing in (None, f.bearing)]
+
+                def look() -> Watched:
+                    return watch(map(found.history, names), rules, failures=failed, silences=silences(found), now=now)
+
+                watched = look()
+                if v.acknowledge is not None:
+                    said = {"now": now, "who": v.who or "", "why": v.why, "until": until}
+                    own = take_note(found, watched.alarms, v.acknowledge, **said)
+                    typer.echo(f"{', '.join(a.rule for a in own)}: noted in {found.shown}", err=True)
+                    watched = look()
+                result = watched
                 for path in gauges:
                     outputs.stage(path, lambda beside: write_metrics(watched, beside))
                 for broker in (x for x in v.publish or () if not x.endswith(METRICS_ENDINGS)):

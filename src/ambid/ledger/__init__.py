@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
+    from ambid.ledger.alarm import Alarm as Alarm
+    from ambid.ledger.alarm import Silence as Silence
     from ambid.ledger.entry import Correction as Correction
     from ambid.ledger.entry import Entry as Entry
     from ambid.ledger.entry import entry_of as entry_of
     from ambid.ledger.history import History as History
     from ambid.ledger.history import Series as Series
-    from ambid.ledger.monitor import Alarm as Alarm
     from ambid.ledger.monitor import Watched as Watched
     from ambid.ledger.monitor import watch as watch
+    from ambid.ledger.rules import RecordRule as RecordRule
     from ambid.ledger.rules import Rule as Rule
     from ambid.ledger.rules import read_rules as read_rules
     from ambid.ledger.store import FleetRun as FleetRun

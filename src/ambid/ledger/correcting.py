@@ -163,13 +163,14 @@ def note(
     """Enter a correction; `old`: what each estimate had before, by key; none where it was not there."""
     from sqlalchemy import insert
 
-    facts: Any = {"at": time.time(), "who": who or _user(), "kind": kind, "bearing": bearing, "text": text, "why": why}
+    facts: Any = {"at": time.time(), "who": who or user(), "kind": kind, "bearing": bearing, "text": text, "why": why}
     packed = zlib.compress(json.dumps(old).encode())
     done: Any = c.execute(insert(tables().tables["correction"]).values(**facts, old=packed))
     return Correction(done.inserted_primary_key[0], **facts)
 
 
-def _user() -> str:
+def user() -> str:
+    """Return who is at work: account and host."""
     try:
         return f"{getpass.getuser()}@{socket.gethostname()}"
     except (KeyError, OSError):  # an account without a name

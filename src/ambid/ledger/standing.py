@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
+from ambid.ledger.alarm import Alarm, Silence
 from ambid.ledger.history import History, KnownEstimate
-from ambid.ledger.monitor import Alarm, watch
-from ambid.ledger.rules import BUILT_IN, Rule
+from ambid.ledger.monitor import watch
+from ambid.ledger.rules import BUILT_IN, RecordRule, Rule
 
-_LATE = 3.0  # usual times between two estimates after which the last usable one is stale
-_DAY_S = 86400.0
-_UNKNOWN_S = 30.0 * _DAY_S  # that time where two estimates do not say what is usual
+if TYPE_CHECKING:
+    from ambid.ledger.store import Failure
+
+_OF_RECORDS = ("stale", "unusable", "failed")  # alarms that are a state of their own
 
 State = Literal["alarm", "unusable", "stale", "caution", "good"]
 STATES: tuple[State, ...] = ("alarm", "unusable", "stale", "caution", "good")
@@ -42,24 +42,28 @@ class Standing:
         recent, caution.
         """
         age = self.age_s(now)
-        if self.alarms:
+        kinds = {a.kind for a in self.alarms if a.open}
+        if kinds - set(_OF_RECORDS):
             return "alarm"
-        if age is None or self.last.verdict == "unusable":
+        if age is None or self.last.verdict == "unusable" or kinds & {"unusable", "failed"}:
             return "unusable"
         if age > self.stale_after_s:
             return "stale"
         return "caution" if self.last.verdict == "caution" else "good"
 
 
-def standing_of(history: History, rules: Sequence[Rule] = BUILT_IN) -> Standing:
-    """Return how a bearing stands, by its history and rules of alarms."""
-    taken = np.array([e.taken_at for e in history.estimates])
-    gaps = np.diff(taken)
-    usual = float(np.median(gaps[gaps > 0.0])) if np.count_nonzero(gaps > 0.0) > 1 else None
+def standing_of(
+    history: History,
+    rules: Sequence[Rule | RecordRule] = BUILT_IN,
+    *,
+    failures: Sequence[Failure] = (),
+    silences: Sequence[Silence] = (),
+    now: float | None = None,
+) -> Standing:
+    """Return how a bearing stands, by its history, rules of alarms, what failed and what somebody has taken note of."""
+    watched = watch([history], rules, failures=failures, silences=silences, now=now)
     usable = [e for e in history.estimates if e.verdict != "unusable"]
     return Standing(
         bearing=history.bearing, plant=history.plant, estimates=len(history.estimates), last=history.estimates[-1],
-        usable=usable[-1] if usable else None,
-        stale_after_s=_UNKNOWN_S if usual is None else max(_LATE * usual, _DAY_S),
-        alarms=watch([history], rules).standing,
+        usable=usable[-1] if usable else None, stale_after_s=watched.states[0].overdue_s, alarms=watched.standing,
     )  # fmt: skip

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from ambid.errors import AmbidError, counted, needs
+from ambid.estimation.estimate import plain_json
+from ambid.ledger.alarm import KINDS
 from ambid.ledger.history import History
-from ambid.ledger.monitor import Watched
+from ambid.ledger.monitor import Now, Watched
 from ambid.settings.caller import setting
 
 PATIENCE_S = 10.0  # for which a broker may stay silent
@@ -43,18 +45,39 @@ def write_metrics(watched: Watched, path: str | Path) -> None:
 
     value = gauge("parameter", "Latest usable value, SI", "parameter", "unit")
     sd = gauge("parameter_sd", "Its standard deviation, SI", "parameter", "unit")
-    taken = gauge("record_timestamp_seconds", "When the latest record was taken")
-    alarm = gauge("alarm", "1 where the alarm stands", "parameter", "rule")
+    since = gauge("parameter_timestamp_seconds", "When the record of the latest usable value was taken", "parameter")
+    age = gauge("parameter_age_seconds", "Age of the latest usable value when this was written", "parameter")
+    taken = gauge("record_timestamp_seconds", "When the record of the latest estimate was taken, usable or not")
+    success = gauge("success_timestamp_seconds", "When the record of the latest usable estimate was taken")
+    overdue = gauge("overdue_timestamp_seconds", "From when the next estimate is overdue")
+    verdict = gauge("verdict", "1 for the verdict of the latest estimate", "verdict")
+    failures = gauge("failures", "Records without an estimate")
+    alarm = gauge("alarm", "1 where the alarm stands and nobody has taken note", "parameter", "rule")
+    noted = gauge("alarm_noted", "1 where it stands and was acknowledged or silenced", "parameter", "rule")
+    Gauge("ambid_watched_timestamp_seconds", "When this was written", registry=registry).set(watched.at)
+    for s in watched.states:
+        failures.labels(s.bearing).set(s.failures)
+        for word in ("usable", "caution", "unusable"):
+            verdict.labels(s.bearing, word).set(word == s.verdict)
+        if s.latest is not None:
+            taken.labels(s.bearing).set(s.latest)
+            overdue.labels(s.bearing).set(s.latest + s.overdue_s)
+        if s.success is not None:
+            success.labels(s.bearing).set(s.success)
+        for kind in KINDS if watched.records else ():
+            for each in (alarm, noted):
+                each.labels(s.bearing, "", kind).set(0)
     for h in watched.used or ():
-        taken.labels(h.bearing).set(h.estimates[-1].taken_at)
         for name, x in _latest(h).items():
             value.labels(h.bearing, name, x["unit"]).set(x["value"])
             sd.labels(h.bearing, name, x["unit"]).set(x["sd"])
-            for rule in watched.rules:
-                if rule.of(name):
-                    alarm.labels(h.bearing, name, str(rule)).set(0)
+            since.labels(h.bearing, name).set(x["taken_at"])
+            age.labels(h.bearing, name).set(watched.at - x["taken_at"])
+            for rule in (str(r) for r in watched.rules if r.of(name)):
+                for each in (alarm, noted):
+                    each.labels(h.bearing, name, rule).set(0)
     for a in watched.standing:
-        alarm.labels(a.bearing, a.parameter, a.rule).set(1)
+        (alarm if a.open else noted).labels(a.bearing, a.parameter, a.rule).set(1)
     Path(path).write_bytes(generate_latest(registry))
 
 
@@ -109,8 +132,8 @@ def publish(watched: Watched, where: str) -> int:
         if refused:
             raise AmbidError(f"{setting('publish', where)}: {refused}. Check user and password")
         sent = [
-            client.publish(f"{topic.strip('/')}/{_plain(h.bearing)}", _message(watched, h), qos=1, retain=True)
-            for h in watched.used or ()
+            client.publish(f"{topic.strip('/')}/{_plain(s.bearing)}", _message(watched, s), qos=1, retain=True)
+            for s in watched.states
         ]
         for message in sent:
             message.wait_for_publish(PATIENCE_S)
@@ -149,11 +172,14 @@ def _latest(h: History) -> dict[str, dict[str, Any]]:
     return latest
 
 
-def _message(watched: Watched, h: History) -> str:
-    return json.dumps(
+def _message(watched: Watched, s: Now) -> str:
+    values = {name: x for h in watched.used or () if h.bearing == s.bearing for name, x in _latest(h).items()}
+    for x in values.values():
+        x["age_s"] = watched.at - x["taken_at"]
+    return json.dumps(plain_json(
         {
-            "schema": "ambid.message/1", "bearing": h.bearing, "taken_at": h.estimates[-1].taken_at,
-            "verdict": h.estimates[-1].verdict, "values": _latest(h),
-            "alarms": [asdict(a) for a in watched.standing if a.bearing == h.bearing],
+            "schema": "ambid.message/1", "bearing": s.bearing, "at": watched.at, "taken_at": s.latest,
+            "verdict": s.verdict, "success_at": s.success, "overdue_s": s.overdue_s, "failures": s.failures,
+            "values": values, "alarms": [asdict(a) for a in watched.standing if a.bearing == s.bearing],
         }
-    )  # fmt: skip
+    ))  # fmt: skip

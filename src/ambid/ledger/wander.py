@@ -10,7 +10,7 @@ from ambid.arrays import Array
 
 _BLOCKS = 64  # into which longer histories are averaged
 _TIMES = (2.0, 5.0, 12.0, 30.0, 80.0, 200.0)  # time constants, in usual times between two values
-_SHARES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # variances of the wander over that of a value
+_SHARES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # variances of the wander over that of a block
 _PRIOR = 4.0  # values' worth of belief that the standard deviations said are right
 
 
@@ -21,16 +21,13 @@ def beyond_wander(t: Array, y: Array, w: Array, shape: Array) -> tuple[float, fl
     `t`, `y`, `shape`: time, value and the change's course, each (n,); `w`: reciprocal variances.
     """
     first = np.unique(np.linspace(0, y.size, min(y.size, _BLOCKS) + 1).astype(int)[:-1])
-    sizes, W = np.diff([*first, y.size]), np.add.reduceat(w, first)
+    W = np.add.reduceat(w, first)
     at, mean, course = (np.add.reduceat(w * x, first) / W for x in (t, y, shape))
     usual = float(np.median(np.diff(t)[np.diff(t) > 0.0]))
     lag = np.abs(at[:, None] - at) / usual
     taus = np.array([tau for tau in _TIMES if tau <= y.size])
     K = np.exp(-lag / taus[:, None, None])
-    inside = np.maximum(sizes - 1.0, 1e-3) / taus[:, None]  # what is left of a wander's variance in a block's mean
-    own = np.arange(first.size)
-    K[:, own, own] = 2.0 * (inside - 1.0 + np.exp(-inside)) / inside**2
-    wander = (np.array(_SHARES)[:, None, None, None] * K * float(np.mean(1.0 / w))).reshape(-1, first.size, first.size)
+    wander = (np.array(_SHARES)[:, None, None, None] * K * float(np.mean(1.0 / W))).reshape(-1, *lag.shape)
     C = np.concatenate([np.zeros_like(K[:1]), wander]) + np.diag(1.0 / W)
     L = np.linalg.cholesky(C)
     U = np.linalg.solve(L, np.broadcast_to(np.column_stack([np.ones_like(at), course, mean]), (*C.shape[:2], 3)))

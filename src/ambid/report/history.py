@@ -16,9 +16,10 @@ from ambid.arrays import Array
 from ambid.control.zones import Zone
 from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95
+from ambid.ledger.alarm import Alarm
 from ambid.ledger.entry import Correction, Note, day
 from ambid.ledger.history import History, Series
-from ambid.ledger.monitor import Alarm, Watched
+from ambid.ledger.monitor import Watched
 from ambid.ledger.store import Failure, KnownBearing
 from ambid.ledger.trends import Trend
 from ambid.report.document import Document, Frame, Lines, Section, grid
@@ -164,41 +165,63 @@ _PANELS = 8
 
 def watch_document(watched: Watched, _: Any) -> Document:
     """Describe bearings that are watched."""
-    title = f"{counted(len(watched.bearings), 'bearing')}, {counted(len(watched.standing), 'alarm')} standing"
+    title = f"{counted(len(watched.bearings), 'bearing')}, {counted(len(watched.open), 'open alarm')}"
     return Document(
         title=title, sections=watch_sections(watched), figure=partial(watch_figure, watched, title),
-        frame=lambda: ("bearing", {f.name: [getattr(a, f.name) for a in watched.alarms] for f in fields(Alarm)}),
+        frame=lambda: ("bearing", {
+            **{f.name: [getattr(a, f.name) for a in watched.alarms] for f in fields(Alarm) if f.name != "noted"},
+            "noted": [noted_text(a).removeprefix(", ") for a in watched.alarms],
+        }),
     )  # fmt: skip
 
 
 def watch_sections(watched: Watched) -> list[Section]:
     """Say what was watched: alarms with date and cause, then what moved without one."""
     w = watched
-    rules = ", ".join(map(str, w.rules))
+    rules = ", ".join(map(str, (*w.rules, *w.records)))
     head: Line = [(counted(len(w.bearings), "bearing"), "strong"), " watched for ", rules]
-    alarms: list[Line] = [[f"{a.bearing}  ", _alarm(a)] for a in w.alarms]
+    groups = [
+        ("alarms", [a for a in w.alarms if a.open]),
+        ("acknowledged and silenced alarms", [a for a in w.standing if not a.open]),
+        ("cleared alarms", [a for a in w.alarms if a.cleared is not None]),
+    ]
     moved = [t for t in w.trends if t.kind != "none"]
     rest, still = len(moved) - _TRENDS, len(w.trends) - len(moved)
     rows = [_trend(t) for t in moved[:_TRENDS]]
     return [
         Section(parts=[Lines(lines=[head], hang=True, indent=2)]),
-        Section(
-            heading=[("alarms", "strong")] if alarms else "",
-            parts=[Lines(lines=alarms or [["", "no alarm"]], hang=True, indent=4)],
-        ),
+        *(_alarms(heading, alarms) for heading, alarms in groups),
+        Section(parts=[Lines(lines=[] if w.standing else ["no alarm stands"])]),
         Section(heading=[("what moved", "strong")], parts=[grid([("",) * 4, *rows], bare=True)] if rows else []),
         Section(parts=[Lines(lines=[f"{counted(rest, 'more')} in {setting('json')}"] if rest > 0 else [])]),
         Section(parts=[Lines(lines=[f"{counted(still, 'parameter')} without a change"] if still else [])]),
     ]
 
 
+def _alarms(heading: str, alarms: Sequence[Alarm]) -> Section:
+    lines: list[Line] = [[f"{a.bearing}  ", _alarm(a)] for a in alarms]
+    return Section(heading=[(heading, "strong")] if lines else "", parts=[Lines(lines=lines, hang=True, indent=4)])
+
+
 def _alarm(a: Alarm) -> str:
     past = "" if a.cleared is None else f", cleared {day(a.cleared)}"
+    raised = f"(alarm {a.rule}), raised {day(a.raised)}{past}{noted_text(a)}"
+    if a.change is None or a.change_sd is None:
+        return f"{a.parameter or 'records'} {raised}; {a.cause}"
     how = "stepped" if a.kind == "step" else "crossed the limit"
     return (
-        f"{a.parameter} {percent(a.change, a.change_sd)} (alarm {a.rule}), raised {day(a.raised)}{past}; {how} "
+        f"{a.parameter} {percent(a.change, a.change_sd)} {raised}; {how} "
         f"{day(a.at)} (95 %: {day(a.at_from)} to {day(a.at_to)}); {a.cause}"
     )
+
+
+def noted_text(a: Alarm) -> str:
+    """Say who has taken note of an alarm, until when and why."""
+    if a.noted is None:
+        return ""
+    word = "silenced" if a.noted.kind == "silence" else "acknowledged"
+    until = "" if a.noted.until is None else f" until {day(a.noted.until)}"
+    return f", {word} {day(a.noted.at)} by {a.noted.who}{until}: {a.noted.why}"
 
 
 def _trend(t: Trend) -> tuple[str, ...]:
@@ -213,22 +236,23 @@ def watch_figure(watched: Watched, title: str, width: float) -> Figure:
     if watched.used is None:
         return stacked(title, [said_panel("figures need the histories, which a file of alarms does not hold")], width)
     histories = {h.bearing: h for h in watched.used}
-    first = {(a.bearing, a.parameter): a for a in reversed(watched.alarms)}
+    first = {(a.bearing, a.parameter): a for a in reversed(watched.alarms) if a.parameter and a.bearing in histories}
     alarms = list(reversed(first.values()))[:_PANELS]
     if not alarms:
-        return stacked(title, [said_panel("no alarm")], width)
+        return stacked(title, [said_panel("no alarm of a parameter")], width)
 
     def draw(axes: Axes, a: Alarm) -> None:
         scale = draw_parameter(axes, histories[a.bearing], a.parameter)
-        limit = a.limit / scale
-        axes.axhline(limit, color=BOUND, linewidth=1.0, label="limit")
         at: Any = dates(np.array([a.at_from, a.at_to, a.raised]))
         axes.axvspan(at[0], at[1], color=ORANGE, alpha=0.35, linewidth=0, label="date, 95 %")
         axes.axvline(at[2], color=BOUND, linestyle="--", linewidth=1.0, label="alarm raised")
-        low, high = axes.get_ylim()
-        room = 0.05 * (high - low)
-        axes.set_ylim(min(low, limit - room), max(high, limit + room))
-        head(axes, f"{a.bearing}: {a.cause}", good=a.cleared is not None)
+        if a.limit is not None:
+            limit = a.limit / scale
+            axes.axhline(limit, color=BOUND, linewidth=1.0, label="limit")
+            low, high = axes.get_ylim()
+            room = 0.05 * (high - low)
+            axes.set_ylim(min(low, limit - room), max(high, limit + room))
+        head(axes, f"{a.bearing}: {a.cause}", good=not a.open)
 
     return stacked(title, [Block(columns=[[panel(draw, a, height=2.0) for a in alarms]], shared=False)], width)
 

@@ -124,7 +124,8 @@ _JOBS = (
     ),
     declare(
         "history",
-        "ledger bearing every rename redate remove record undo who why export alarms publish json plot report strict",
+        "ledger bearing every rename redate remove record undo alarms acknowledge until who why export publish json "
+        "plot report strict",
         record={
             "kind": "text",
             "help": "Only this record of the bearing: name of its file, or digits of its SHA-256.",

@@ -5,12 +5,20 @@ from __future__ import annotations
 from ambid.settings.schema import Setting
 
 SETTINGS = (
+    Setting(
+        "acknowledge",
+        "text",
+        "RULE",
+        "Take note of an alarm of the bearing that stands, by its rule or parameter: it is shown with @who and @why, "
+        "and returns when it grows, or is raised anew; with @until whatever the rule raises is silenced until then.",
+    ),
     Setting("again", "text", "failed", "Do records again that failed before."),
     Setting(
         "alarms",
         "text",
         "RULES.toml|usual",
-        "Watch the bearing, or all of them, for drifts and steps: by rules of a file, or by the usual ones.",
+        "Watch the bearing, or all of them, for drifts, steps and what is missing: by rules of a file, or by the usual "
+        "ones.",
     ),
     Setting("amplitude", "positive", "V", "Peak of the excitation in V.", shown="found by trials, smallest first"),
     Setting(
@@ -478,6 +486,7 @@ SETTINGS = (
     Setting(
         "undo", "whole", "N", "Put back what correction N changed; the history of the bearing numbers them.", least=1
     ),
+    Setting("until", "text", "TIME", "With @acknowledge: when it is over, such as 2026-03-01T14:30, of UTC."),
     Setting("validate", "path", "RECORD2", "Validate on this record too, on all of it."),
     Setting("who", "text", "NAME", "Who does this.", shown="account and host"),
     Setting("why", "text", "TEXT", "For what reason."),
