@@ -31,8 +31,7 @@ def times(habit: str, rng: np.random.Generator, shut: bool = True) -> np.ndarray
         case "working days":
             t = np.arange(days)
             t = t[(t % 7 < 5) & (rng.random(t.size) > MISSING)]
-            for off in rng.choice(int(days) - 5, 9, replace=False):  # long weekends
-                t = t[(t < off) | (t > off + 4)]
+            t = t[(t % 91 < 56) | (t % 91 > 58)]  # long weekends, of five days
         case _:
             every = {"daily": 1.0, "every third day": 3.0, "weekly": 7.0, "monthly": 30.4}[habit]
             t = np.arange(0.0, days, every)

@@ -20,6 +20,7 @@ _SLOT = 0.5, 1.5  # usual times from the nearest record, between which one is du
 _BESIDE = 5  # values before and after, from which a level is taken
 _NEAR, _FAR, _OFF = 5.0, 8.0, 6.0  # standard deviations within which numbers agree, at most, and beyond which not
 _ENOUGH = 3  # numbers that agree, where the names are not alike
+_SURE = 4  # numbers that are strange, where the rig is another one
 
 
 @dataclass(slots=True)
@@ -58,11 +59,11 @@ def misnamed(histories: Sequence[History], now: float) -> Iterator[Alarm]:
         return
     for x in every:
         small = x.t.size <= _FEW
-        for k in range(x.t.size) if small else _strange(x.h):
+        for k, strange in dict.fromkeys(range(x.t.size), _SURE).items() if small else _strange(x.h).items():
             e = x.h.estimates[k]
             if not plausible(e, now):
                 continue
-            fits = [(w, host) for host in hosts if host is not x and (w := _fit(x, k, host)) is not None]
+            fits = [(w, host) for host in hosts if host is not x and (w := _fit(x, k, host, strange)) is not None]
             if fits:
                 host = min(fits, key=lambda fit: fit[0])[1].h
                 yield Alarm(
@@ -78,8 +79,10 @@ def _usual(h: History) -> float:
     return math.nan if usual is None else usual
 
 
-def _strange(h: History) -> list[int]:
-    """Return the estimates of which two numbers at least lie far from those around them."""
+def _strange(h: History) -> dict[int, int]:
+    """Return the estimates of which two numbers at least lie far from those around them, and how many; those with
+    another rig than the ones before and after are strange too.
+    """
     count = np.zeros(len(h.estimates), dtype=int)
     for s in h.measured.values():
         there = np.flatnonzero(np.isfinite(s.value) & np.isfinite(s.sd))
@@ -88,19 +91,25 @@ def _strange(h: History) -> list[int]:
             around = np.lib.stride_tricks.sliding_window_view(np.pad(y, _BESIDE, mode="reflect"), 2 * _BESIDE + 1)
             left = np.abs(y - np.median(around, axis=1))
             count[s.estimate[there[left > _OFF * np.maximum(s.sd[there], 1.4826 * np.median(left))]]] += 1
-    return np.flatnonzero(count > 1).tolist()
+    rigs = [e.rig_sha for e in h.estimates]
+    odd = {k: 2 for k in range(1, len(rigs) - 1) if rigs[k] not in (rigs[k - 1], rigs[k + 1])}
+    return odd | {int(k): int(count[k]) for k in np.flatnonzero(count > 1)}
 
 
-def _fit(x: _Habits, k: int, host: _Habits) -> float | None:
-    """Return how far the numbers of an estimate lie from a host's, None where it does not belong there."""
+def _fit(x: _Habits, k: int, host: _Habits, strange: int) -> float | None:
+    """Return how far the numbers of an estimate lie from a host's, None where it does not belong there; `strange`: how
+    many of them are strange where it stands.
+    """
     e = x.h.estimates[k]
     place = int(np.searchsorted(host.t, e.taken_at))
     nearest = min((abs(e.taken_at - host.t[j]) for j in (place - 1, place) if 0 <= j < host.t.size), default=math.inf)
     like = x.t.size <= _FEW and _alike(x.h.bearing, host.h.bearing)
     if not _SLOT[0] <= nearest / host.usual_s <= (math.inf if like else _SLOT[1]):
         return None
-    far = host.distances(x.numbers.get(k, {}), e.taken_at)
     same_rig = e.rig_sha == host.h.estimates[min(place, host.t.size - 1)].rig_sha
+    if not same_rig and strange < _SURE:
+        return None
+    far = host.distances(x.numbers.get(k, {}), e.taken_at)
     if not far and like and same_rig:  # nothing usable in it
         return -math.inf
     if max(far, default=math.inf) > _FAR or (not like and sum(z < _NEAR for z in far) < _ENOUGH):

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ambid.ledger.store import Failure
 
 _UNKNOWN_S = 92.0 * DAY_S  # what is overdue where fewer than three estimates, or less than a week, do not say
+_YOUNG = 30  # pauses, of which that is less certain by half
 _LONGEST_S = 182.0 * DAY_S  # however irregular a bearing is
 _WEEK_S = 7.0 * DAY_S  # works that rest on two of its days are known after one
 _LATEST = 100  # pauses of which the usual one is learnt
@@ -93,7 +94,7 @@ def _overdue(order: Sequence[float], rule: RecordRule, known_s: float) -> float:
         return _UNKNOWN_S
     median = 0.5 * (order[n // 2] + order[(n - 1) // 2])
     high = order[n - 1 - (n > _WEIGHT)]
-    irregular = min(high + _BEYOND * (1.0 + _WEIGHT / n) * (high - median), _LONGEST_S)
+    irregular = min(high + _BEYOND * (1.0 + _YOUNG / n) * (high - median), _LONGEST_S)
     return max(rule.late * median, irregular, DAY_S)
 
 
