@@ -30,7 +30,7 @@ def test_sound_histories_have_no_alarm():
 
 def test_overdue_is_learnt_and_a_new_habit_too():
     weekly = pauses(7 * DAY * np.arange(20), RecordRule())
-    assert (weekly.usual_s, weekly.overdue_s, weekly.long) == (7 * DAY, 24.5 * DAY, ())
+    assert (weekly.usual_s, weekly.overdue_s, weekly.long) == (7 * DAY, 31.5 * DAY, ())
     given = pauses(7 * DAY * np.arange(20), RecordRule(every_s=DAY, late=2.0))
     assert (given.overdue_s, len(given.long)) == (2 * DAY, 19)
     slower = np.cumsum([*[1.0] * 60, *[10.0] * 200]) * DAY

@@ -15,13 +15,13 @@ def standing(tmp_path, entries):
         return standing_of(ledger.history("A"), now=max(e.taken_at for e in entries))
 
 
-def test_a_bearing_that_is_looked_at_every_day_is_stale_after_three(tmp_path):
+def test_a_bearing_that_is_looked_at_every_day_is_stale_after_four_and_a_half(tmp_path):
     found = standing(tmp_path, [entry(k) for k in range(10)])
     last = BEGIN + 9 * DAY
-    assert (found.estimates, found.stale_after_s) == (10, 3.5 * DAY)
+    assert (found.estimates, found.stale_after_s) == (10, 4.5 * DAY)
     assert found.age_s(last + 3600.0) == 3600.0
-    assert found.state(last + 2 * DAY) == "good"
-    assert found.state(last + 4 * DAY) == "stale"
+    assert found.state(last + 4 * DAY) == "good"
+    assert found.state(last + 5 * DAY) == "stale"
 
 
 def test_a_single_estimate_is_stale_after_three_months(tmp_path):

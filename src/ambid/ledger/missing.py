@@ -66,7 +66,7 @@ class Pauses:
 def pauses(taken: Array, rule: RecordRule) -> Pauses:
     """Return how estimates follow each other, each pause judged by those before it; `taken`: s since 1970, ascending.
 
-    Overdue is what is later than three and a half usual times, and than what an irregular bearing has shown: the
+    Overdue is what is later than four and a half usual times, and than what an irregular bearing has shown: the
     longest but one of its last 100 pauses, and four times as far again from their median, more of a short history.
     A pause that was told counts as one at the limit, so that a new habit is learnt.
     """

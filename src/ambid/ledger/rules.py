@@ -77,7 +77,7 @@ class RecordRule:
 
     bearing: str = ""
     every_s: float | None = None
-    late: float = 3.5
+    late: float = 4.5
     unusable: int | None = None
 
     def __str__(self) -> str:
@@ -152,7 +152,7 @@ def _record_rule(entry: Mapping[str, Any], where: str) -> RecordRule:
         if x is not None and (isinstance(x, bool) or not isinstance(x, kinds) or not least <= x < math.inf):
             raise AmbidError(f"{where}: {name} is {x!r}; it must be a number from {least}. Correct it")
     return RecordRule(
-        bearing=bearing or "", every_s=every_s, late=3.5 if late is None else float(late), unusable=unusable
+        bearing=bearing or "", every_s=every_s, late=4.5 if late is None else float(late), unusable=unusable
     )
 
 

@@ -46,8 +46,8 @@ function draw() {
     : `${fits.length} of ${rows.length} bearings: ${GRAVE.filter(count).map((s) => `${count(s)} ${STATES[s][0]}`).join(", ")}.`),
   rows.length ? el("table", { className: "fleet" }, el("thead", {}, el("tr", {}, ...heads)),
     el("tbody", {}, ...fits.map((r) => el("tr", { onclick: () => go(r) }, ...COLUMNS.map((c, k) => cell(r, c, k)))))) : null,
-  rows.length ? el("p", { className: "hint" }, "Age is that of the last usable estimate; it is stale after three times the usual "
-    + "time between two estimates of the bearing, at least a day. Alarms are those of the built-in rules, as 'ambid history --alarms' "
+  rows.length ? el("p", { className: "hint" }, "Age is that of the last usable estimate; it is stale after four and a half times "
+    + "the usual time between two estimates of the bearing, later where they come irregularly, at least a day. Alarms are those of the built-in rules, as 'ambid history --alarms' "
     + "tells them. Times are UTC.") : null);
 }
 async function look() {
