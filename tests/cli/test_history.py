@@ -159,3 +159,25 @@ def test_a_correction_that_is_not_clear_is_refused(demo, ambid, monkeypatch, wor
     assert said in done.err
     assert ambid("history", "A", "--ledger", "none.db", "--remove").code == 2
     assert not (demo / "none.db").exists()
+
+
+def test_a_silent_bearing_ends_in_three_until_somebody_takes_note(demo, ambid, monkeypatch):
+    monkeypatch.chdir(demo)
+    with open_ledger("silent.db") as ledger:
+        ledger.add([entry(k, day=k - 400) for k in range(30)])  # to 2024-12-26
+    words = ("history", "--ledger", "silent.db", "--alarms", "usual", "--strict")
+    silent = ambid(*words)
+    assert (silent.code, "records (alarm stale), raised 2024-12-30" in silent.out) == (3, True)
+    note = ("--acknowledge", "stale", "--why", "dismounted")
+    for more, said in (
+        (note, "needs the name of the BEARING, and --why"),
+        (("A", *note[:2]), "needs the name of the BEARING, and --why"),
+        (("A", "--until", "2027-01-01"), "--until needs --acknowledge"),
+        (("A", *note, "--until", "soon"), "--until is 'soon'"),
+        (("A", "--acknowledge", "k_i", "--why", "x"), "no alarm 'k_i' stands; those that stand: stale."),
+    ):
+        refused = ambid(words[0], *more, *words[1:])
+        assert (refused.code, said in refused.err) == (2, True), refused.err
+    noted = ambid("history", "A", *words[1:], *note, "--who", "A. Smith")
+    assert (noted.code, "by A. Smith: dismounted" in noted.out) == (0, True)
+    assert ambid(*words).code == 0

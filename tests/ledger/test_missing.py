@@ -1,15 +1,17 @@
 """What is missing or wrong in the records of bearings is an alarm, what is usual none, and somebody may take note."""
 
+import json
 import time
 
 import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.ledger import RecordRule, Rule, open_ledger, read_rules, watch
+from ambid.ledger import RecordRule, Rule, open_ledger, read_rules, watch, write_metrics
 from ambid.ledger.missing import pauses
 from ambid.ledger.silences import silences, take_note
 from ambid.ledger.store import Failure
+from ambid.ledger.telling import message
 from tests.ledger.entries import BEGIN, DAY, entry, parameter
 from tests.ledger.faults import FAULTS, YEARS, ill, quiet_alarms
 from tests.ledger.simulated import BEGIN as START
@@ -83,6 +85,26 @@ def test_a_bearing_of_which_every_record_failed_is_watched_too(ledger):
     (alarm,) = (a for a in found.open if a.bearing == "new")
     assert (alarm.kind, alarm.cause) == ("failed", "3 records in succession failed, 3 of them by it has a gap")
     assert {s.bearing: s.failures for s in found.states} == {"worn": 0, "new": 3}
+
+
+def test_metrics_and_messages_give_no_old_value_a_fresh_time(ledger, tmp_path):
+    parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is not installed")
+    ledger.add([entry(k, "worn", verdict="unusable", parameters=(parameter("k_i", 1.0, 0.1),)) for k in range(30, 60)])
+    found = look(ledger, BEGIN + 60 * DAY)
+    write_metrics(found, tmp_path / "a.prom")
+    text = (tmp_path / "a.prom").read_text()
+    sample = {f.name: f.samples for f in parser.text_string_to_metric_families(text)}
+    value = {name: samples[0].value for name, samples in sample.items() if len(samples) == 1}
+    assert value["ambid_parameter_timestamp_seconds"] == value["ambid_success_timestamp_seconds"] == BEGIN + 29 * DAY
+    assert value["ambid_record_timestamp_seconds"] == BEGIN + 59 * DAY
+    assert value["ambid_parameter_age_seconds"] == 31 * DAY
+    assert {x.labels["verdict"]: x.value for x in sample["ambid_verdict"]} == {"usable": 0, "caution": 0, "unusable": 1}
+    assert {x.labels["rule"] for x in sample["ambid_alarm"] if x.value} == {"k_i -5 %", "unusable"}
+    said = json.loads(message(found, found.states[0]))
+    assert (said["verdict"], said["success_at"], said["values"]["k_i"]["age_s"]) == (
+        "unusable", BEGIN + 29 * DAY, 31 * DAY,
+    )  # fmt: skip
+    assert {a["rule"] for a in said["alarms"]} == {"k_i -5 %", "unusable"}
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,10 @@ def test_an_alarm_is_cleared_where_the_level_comes_back():
     assert alarm.at_from <= h.estimates[121].taken_at <= alarm.at_to
     assert h.estimates[200].taken_at < alarm.cleared < h.estimates[210].taken_at
     assert "no single cause that is known does that" in alarm.cause
-    assert "k_i alone moved, which rules out the magnet's bias flux (would move k_x by -28 %)" in alarm.cause
+    assert (
+        "k_i alone of m, k_x, k_i, R, L moved, which rules out the magnet's bias flux (would move k_x by -28 %)"
+        in alarm.cause
+    )
     assert watch([h], now=END).passed
 
 
@@ -78,7 +81,9 @@ def test_with_a_held_mass_a_sensor_moves_what_the_record_shows():
 
     rule = Rule(parameter="k_i", change=0.05)
     (alone,) = cause(k_i=1)
-    assert alone.startswith("the position sensor's gain stepped: exchanged or damaged; k_i alone moved")
+    assert alone.startswith(
+        "the position sensor's gain stepped: exchanged or damaged; k_i alone of k_x, k_i, R, L moved"
+    )
     rule = Rule(parameter="k_i", change=-0.05)
     assert cause(k_i=-1, R=-1, L=-1) == {"the current sensor's gain stepped: exchanged or damaged"}
     flux, position = "the magnet's bias flux stepped: cracked or demagnetised", "the position sensor's gain stepped"

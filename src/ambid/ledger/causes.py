@@ -154,11 +154,14 @@ def _likeliest(seen: _Seen, patterns: Sequence[tuple[str, Array]], *, step: bool
     moved = np.flatnonzero(np.abs(seen.change) > _MOVED * np.sqrt(seen.var))
     if moved.size == 1:
         name = _NAMES[seen.places[moved[0]]]
-        could = " or ".join(says[:3]) or "no single cause that is known does that: two at once, or a wrong record"
-        return f"{could}; {name} alone moved{_ruled_out(seen, patterns, int(moved[0]), near)}"
-    if not says:
-        return "the cause is not clear: no single one fits the changes of all parameters"
-    return says[0] if len(says) == 1 else f"the cause is not clear: {' or '.join(says[:3])}"
+        alone = f"{name} alone of {', '.join(_NAMES[j] for j in seen.places)} moved"
+        could = _either(says) or "no single cause that is known does that: two at once, or a wrong record"
+        return f"{could}; {alone}{_ruled_out(seen, patterns, int(moved[0]), near)}"
+    return _either(says) or "the cause is not clear: no single one fits the changes of all parameters"
+
+
+def _either(says: Sequence[str]) -> str:
+    return says[0] if len(says) == 1 else f"the cause is not clear: {' or '.join(says[:3])}" if says else ""
 
 
 def _ruled_out(seen: _Seen, patterns: Sequence[tuple[str, Array]], k: int, near: Sequence[str]) -> str:

@@ -132,7 +132,7 @@ def publish(watched: Watched, where: str) -> int:
         if refused:
             raise AmbidError(f"{setting('publish', where)}: {refused}. Check user and password")
         sent = [
-            client.publish(f"{topic.strip('/')}/{_plain(s.bearing)}", _message(watched, s), qos=1, retain=True)
+            client.publish(f"{topic.strip('/')}/{_plain(s.bearing)}", message(watched, s), qos=1, retain=True)
             for s in watched.states
         ]
         for message in sent:
@@ -172,7 +172,8 @@ def _latest(h: History) -> dict[str, dict[str, Any]]:
     return latest
 
 
-def _message(watched: Watched, s: Now) -> str:
+def message(watched: Watched, s: Now) -> str:
+    """Return what is published of a bearing, as JSON."""
     values = {name: x for h in watched.used or () if h.bearing == s.bearing for name, x in _latest(h).items()}
     for x in values.values():
         x["age_s"] = watched.at - x["taken_at"]
