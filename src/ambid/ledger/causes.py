@@ -20,6 +20,7 @@ _BESIDE = 15  # values on each side of a change, from which its cause is judged
 _CLEAR = 6.0  # by which chi-squared a cause must be likelier than the next
 _MOVED = 3.0  # standard deviations from which a parameter has moved
 _RULED_OUT = 3  # causes that are named as none
+_FAR = 0.7  # logarithmic change beyond which a pattern, which is linear, says nothing
 
 _NAMES = ("m", "k_x", "k_i", "R", "L")
 _CAUSES: Mapping[str, tuple[str, str, str]] = {  # what changes, and what is said of a step and of a drift
@@ -173,6 +174,8 @@ def _ruled_out(seen: _Seen, patterns: Sequence[tuple[str, Array]], k: int, near:
         due = seen.change[k] * v / v[k]
         off = np.abs(due - seen.change) / np.sqrt(seen.var + (_LIKE * due) ** 2)
         j = int(np.argmax(np.where(np.arange(v.size) == k, 0.0, off)))
+        if abs(due[j]) > _FAR:
+            continue
         text = f"{_CAUSES[cause][0]} (would move {_NAMES[seen.places[j]]} by {100 * math.expm1(due[j]):+.2g} %)"
         if cause not in against or off[j] < against[cause][0]:
             against[cause] = float(off[j]), text

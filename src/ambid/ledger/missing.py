@@ -33,6 +33,7 @@ _CHANCE = 1e-7  # of as many records in succession that are not usable as is usu
 _LEAST = 3  # of them
 _USUALLY = 0.1, 0.02  # share of records that are not usable, and that fail, before any is known
 _WEIGHT = 10  # records' worth of that belief
+_SAME = 0.1  # standard deviations between numbers of a record and its copy
 _EARLIEST = 631152000.0  # 1990: a clock that was not set says 1970 or 1980
 _SHOWN = 3  # records that are named
 _PARTS = 40  # of a pause, in which the other bearings are looked at
@@ -212,27 +213,32 @@ def _unseen(h: History, s: Series, rule: RecordRule, now: float) -> Iterator[Ala
 
 
 def _double(h: History, good: Sequence[KnownEstimate]) -> Iterator[Alarm]:
-    """Yield estimates of one record, or of its copy, that both count."""
+    """Yield estimates of one record, or of its copy, that both count: of one SHA-256, of the same numbers to the last
+    digit, or of one time and numbers that are nearly the same.
+    """
     place = {id(e): k for k, e in enumerate(h.estimates)}
-    numbers: dict[int, list[float]] = {}
+    numbers: dict[int, dict[str, tuple[float, float]]] = {}
     for s in h.measured.values():
         for k, value, sd in zip(s.estimate.tolist(), s.value.tolist(), s.sd.tolist(), strict=True):
             if math.isfinite(value):
-                numbers.setdefault(k, []).extend((value, sd))
-    before: dict[object, KnownEstimate] = {}
+                numbers.setdefault(k, {})[s.name] = value, sd
+    before: dict[object, tuple[KnownEstimate, dict[str, tuple[float, float]]]] = {}
     for e in good:
-        own = tuple(numbers.get(place[id(e)], ()))
+        own = numbers.get(place[id(e)], {})
         keys: list[object] = [(e.job, e.taken_at)]
         keys += [(e.job, e.sha)] if e.sha else []
-        keys += [(e.job, own)] if len(own) > 2 else []  # the same numbers to the last digit
-        others = (before[key] for key in keys if key in before)
-        other = next((x for x in others if not e.sha or (x.sha, x.taken_at) != (e.sha, e.taken_at)), None)
-        for key in keys:
-            before.setdefault(key, e)
-        if other is not None:
+        keys += [(e.job, *own.items())] if len(own) > 1 else []
+        for other, its in (before[key] for key in keys if key in before):
+            if e.taken_at == other.taken_at:  # of one SHA-256 the latest estimate counts
+                near = [abs(x - its[name][0]) < _SAME * sd for name, (x, sd) in own.items() if name in its]
+                if (e.sha and e.sha == other.sha) or len(near) < 2 or not all(near):
+                    continue
             first, second = (f"{x.record or 'a record'} of {day(x.taken_at)}" for x in (other, e))
             text = f"one record stored twice: {first} and {second}"
             yield _alarm(h.bearing, "double", e.taken_at, other.taken_at, text)
+            break
+        for key in keys:
+            before.setdefault(key, (e, own))
 
 
 def of_one_bearing(alarms: Iterable[Alarm], histories: Sequence[History]) -> Iterator[Alarm]:
