@@ -67,10 +67,14 @@ def test_an_alarm_that_somebody_has_taken_note_of_is_shown_as_such_and_returns_w
         take_note(ledger, grown.alarms, "k_x", now=now, who="A", why="b")
 
 
+@pytest.mark.drawn
 def test_a_silenced_rule_returns_when_the_time_is_over(ledger):
     now = BEGIN + 60 * DAY
     stale = look(ledger, now)
     assert {a.rule for a in stale.open} == {"k_i -5 %", "stale"}
+    records, k_i = sorted(stale.plot().axes, key=lambda axes: len(axes.get_yticks()))
+    assert [x.get_text() for x in records.get_yticklabels()] == ["do not use", "caution", "usable"]
+    assert k_i.get_ylabel().startswith("k_i")
     take_note(ledger, stale.alarms, "stale", now=now, who="A. Smith", why="dismounted", until=BEGIN + 90 * DAY)
     assert {a.rule for a in look(ledger, BEGIN + 89 * DAY).open} == {"k_i -5 %"}
     assert {a.rule for a in look(ledger, BEGIN + 91 * DAY).open} == {"k_i -5 %", "stale"}

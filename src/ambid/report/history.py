@@ -232,19 +232,24 @@ def _trend(t: Trend) -> tuple[str, ...]:
 
 
 def watch_figure(watched: Watched, title: str, width: float) -> Figure:
-    """Draw the parameters with alarms, with limit, date and its interval."""
+    """Draw the parameters with alarms, with limit, date and its interval, and when records came."""
     if watched.used is None:
         return stacked(title, [said_panel("figures need the histories, which a file of alarms does not hold")], width)
     histories = {h.bearing: h for h in watched.used}
-    first = {(a.bearing, a.parameter): a for a in reversed(watched.alarms) if a.parameter and a.bearing in histories}
+    first = {(a.bearing, a.parameter): a for a in reversed(watched.alarms) if a.bearing in histories}
     alarms = list(reversed(first.values()))[:_PANELS]
     if not alarms:
-        return stacked(title, [said_panel("no alarm of a parameter")], width)
+        return stacked(title, [said_panel("no alarm")], width)
 
     def draw(axes: Axes, a: Alarm) -> None:
-        scale = draw_parameter(axes, histories[a.bearing], a.parameter)
+        h, scale = histories[a.bearing], 1.0
+        if a.parameter:
+            scale = draw_parameter(axes, h, a.parameter)
+        else:
+            _draw_records(axes, h, a)
         at: Any = dates(np.array([a.at_from, a.at_to, a.raised]))
-        axes.axvspan(at[0], at[1], color=ORANGE, alpha=0.35, linewidth=0, label="date, 95 %")
+        label = "from the last sound record to the next" if a.change is None else "date, 95 %"
+        axes.axvspan(at[0], at[1], color=ORANGE, alpha=0.35, linewidth=0, label=label)
         axes.axvline(at[2], color=BOUND, linestyle="--", linewidth=1.0, label="alarm raised")
         if a.limit is not None:
             limit = a.limit / scale
@@ -252,9 +257,33 @@ def watch_figure(watched: Watched, title: str, width: float) -> Figure:
             low, high = axes.get_ylim()
             room = 0.05 * (high - low)
             axes.set_ylim(min(low, limit - room), max(high, limit + room))
-        head(axes, f"{a.bearing}: {a.cause}", good=not a.open)
+        head(axes, f"{a.bearing}: {a.cause.partition(';')[0]}", good=not a.open)
 
-    return stacked(title, [Block(columns=[[panel(draw, a, height=2.0) for a in alarms]], shared=False)], width)
+    panels = [panel(draw, a, height=2.0 if a.parameter else 1.0) for a in alarms]
+    return stacked(title, [Block(columns=[panels], shared=False)], width)
+
+
+def _draw_records(axes: Axes, history: History, a: Alarm) -> None:
+    """Draw when records were taken, a row for each verdict."""
+    for k, (word, colour) in enumerate((("unusable", BOUND), ("caution", ORANGE), ("usable", PREDICTED))):
+        at: Any = dates(np.array([e.taken_at for e in history.estimates if e.verdict == word]))
+        axes.plot(at, np.full(at.size, k), "|", color=colour, markersize=7)
+    ends = sorted([history.estimates[0].taken_at, history.estimates[-1].taken_at, a.at_from, a.at_to])
+    _calendar(axes, ends[0], ends[-1])
+    axes.set_yticks(range(3), ["do not use", "caution", "usable"])
+    axes.set_ylim(-0.6, 2.6)
+
+
+def _calendar(axes: Axes, first: float, last: float) -> None:
+    """Let the horizontal axis be of dates between two times, s since 1970."""
+    from matplotlib import dates as calendar
+
+    room = 0.02 * (last - first) or 43200.0
+    axes.set_xlim(*dates(np.array([first - room, last + room])))
+    place: Any = calendar.AutoDateLocator(tz=UTC)  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(place)
+    axes.xaxis.set_major_formatter(calendar.ConciseDateFormatter(place, tz=UTC))  # type: ignore[no-untyped-call]
+    axes.set_xlabel("record taken (UTC)")
 
 
 _MANY = 6  # parameters from which panels stand in two columns
@@ -284,8 +313,6 @@ def dates(at: Array) -> NDArray[np.datetime64]:
 
 def draw_parameter(axes: Axes, history: History, name: str) -> float:
     """Draw a parameter over time, and return the scale of the drawing."""
-    from matplotlib import dates as calendar
-
     s = history.measured[name]
     finite = np.isfinite(s.value)
     t, half = dates(s.taken_at), NORMAL_95 * s.sd
@@ -308,13 +335,7 @@ def draw_parameter(axes: Axes, history: History, name: str) -> float:
     _gaps(axes, x, s)
     for note in history.events:
         _mark(axes, note, name)
-    first, last = history.estimates[0].taken_at, history.estimates[-1].taken_at
-    room = 0.02 * (last - first) or 43200.0
-    axes.set_xlim(*dates(np.array([first - room, last + room])))
-    place: Any = calendar.AutoDateLocator(tz=UTC)  # type: ignore[no-untyped-call]
-    axes.xaxis.set_major_locator(place)
-    axes.xaxis.set_major_formatter(calendar.ConciseDateFormatter(place, tz=UTC))  # type: ignore[no-untyped-call]
-    axes.set_xlabel("record taken (UTC)")
+    _calendar(axes, history.estimates[0].taken_at, history.estimates[-1].taken_at)
     axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
     out = int(finite.size - finite.sum())
     head(axes, f"{counted(int(finite.sum()), 'value')}{f', {out} not known' if out else ''}", good=bool(finite.any()))
