@@ -40,6 +40,9 @@ def beyond_wander(t: Array, y: Array, w: Array, shape: Array) -> tuple[float, fl
     without, with_it = (n * np.log((_PRIOR + np.maximum(rss, 0.0)) / n) + spread for rss in (level, changed))
     best, curvature = float(with_it.min()), own_level[:, 1, 1]
     chance = np.exp(-0.5 * (with_it - best)) / np.sqrt(curvature)  # of each wander, the size being any
+    chance *= np.concatenate(
+        [[1.0], np.tile(np.sqrt(_TIMES[0] / taus), len(_SHARES))]
+    )  # long ones are held less likely
     chance /= chance.sum()
     size = own_level[:, 1, 2] / curvature
     variance = chance @ ((_PRIOR + np.maximum(changed, 0.0)) / (n - 2.0) / curvature + (size - chance @ size) ** 2)
