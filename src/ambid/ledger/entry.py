@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
-from importlib.metadata import version as installed
+from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from ambid.recursive.lines import Track, is_vague
 from ambid.rig import Rig, rig_text
 from ambid.settings.caller import setting
 
+installed = cache(version_of)  # which reads a file of its own each time
 SCHEMA = "ambid.ledger/1"
 VERSION = 2
 STEPS: Mapping[int, tuple[str, ...]] = {
@@ -200,7 +201,8 @@ def entry_of(
         raise AmbidError(f"the bearing has no name. Give {setting('bearing', 'NAME')}, or a name in the rig")
     track = isinstance(result, Track)
     of = result.header if track else result
-    about: Mapping[str, object] = getattr(of, "record", None) or (getattr(of, "records", None) or ({},))[0]
+    about: Any = getattr(of, "record", None) or (getattr(of, "records", None) or ({},))[0]
+    about = about if isinstance(about, Mapping) else {"file": about}
     began = _time_of(about) if taken_at is None else taken_at
     changes = result.totals.changes if track else ()
     model = getattr(of, "model", None)

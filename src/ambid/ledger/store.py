@@ -196,8 +196,13 @@ class Ledger:
                 for row in c.execute(query.where(e.key.in_(some)))
             }
 
-    def failures(self) -> Mapping[str, Failure]:
+    def failures(self, keys: Iterable[str] | None = None) -> Mapping[str, Failure]:
         """Return by key what failed and has no estimate since.
+
+        Parameters
+        ----------
+        keys : iterable of str, optional
+            Only these.
 
         Returns
         -------
@@ -206,8 +211,10 @@ class Ledger:
         from sqlalchemy import select
 
         t = entry.tables().tables["failure"]
+        queries = [select(t)] if keys is None else [select(t).where(t.c.key.in_(some)) for some in _chunks([*keys])]
         with self._reading() as c:
-            return {row.key: Failure(**{x: row[x] for x in row if x != "key"}) for row in _mappings(c, select(t))}
+            rows = [row for query in queries for row in _mappings(c, query)]
+        return {row.key: Failure(**{x: row[x] for x in row if x != "key"}) for row in rows}
 
     def bearings(self) -> tuple[KnownBearing, ...]:
         """Return the bearings of the ledger, by name, with the number of estimates that count.
@@ -538,6 +545,18 @@ class Ledger:
             if self._postgres:
                 c.exec_driver_sql(f"SELECT pg_advisory_xact_lock{'' if alone else '_shared'}({_MOVING})")
             yield c
+
+    @contextmanager
+    def _writing_alone(self, lock: int) -> Iterator[tuple[Connection, float]]:
+        """Yield a transaction that is alone under its number, and the time, s since 1970: the server's where there is
+        one.
+        """
+        with self._writing() as c:
+            if not self._postgres:
+                yield c, time.time()
+                return
+            c.exec_driver_sql(f"SELECT pg_advisory_xact_lock({lock})")
+            yield c, c.exec_driver_sql("SELECT extract(epoch FROM clock_timestamp())::float8").scalar_one()
 
     @contextmanager
     def _reading(self) -> Iterator[Connection]:
