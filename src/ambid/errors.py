@@ -20,6 +20,10 @@ class AmbidError(Exception):
         super().__init__(" ".join(message.split()))
 
 
+class CircumstanceError(AmbidError):
+    """What was asked for, or what is installed, does not go: that says nothing of a record, and is not remembered."""
+
+
 class UnitError(AmbidError):
     """A unit is unknown, missing, or of another kind than the quantity it stands with."""
 
@@ -74,7 +78,7 @@ def needs(package: str, what: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ImportError:
-        raise AmbidError(f"{package} is not installed, and {what} needs it. Install ambid[{extra}]") from None
+        raise CircumstanceError(f"{package} is not installed, and {what} needs it. Install ambid[{extra}]") from None
 
 
 def counted(n: float | str, noun: str) -> str:

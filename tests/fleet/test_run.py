@@ -8,7 +8,7 @@ import pytest
 import ambid
 from ambid.errors import AmbidError
 from ambid.fleet.run import job_of, run_fleet
-from ambid.fleet.sources import items
+from ambid.fleet.sources import fit_for_ledger, items
 from ambid.ledger import open_ledger
 from ambid.rig import default_rig, write_rig
 from ambid.rig.draft import rig_of_preset
@@ -26,6 +26,7 @@ def folder(tmp_path_factory):
         (place / f"2026-03-01T{k // 2:02}.txt").write_text(words.get(k, str(k)))
     write_rig(default_rig(), made / "a.toml")
     write_rig(default_rig(), made / "b.toml")
+    write_rig(replace(default_rig(), name=" "), made / "unnamed.toml")
     return made
 
 
@@ -198,6 +199,13 @@ def test_a_table_that_leaves_something_open_is_refused(folder, tmp_path, table, 
         ([], {"job": "identfy"}, "Did you mean 'identify'"),
         ([], {"settings": {"form_s": 1}}, "Did you mean 'from_s'"),
         ([], {"job": "fit"}, "fit needs structure"),
+        ([], {"settings": {"from_s": "x"}}, "from_s is 'x'; it must be a number"),
+        ([], {"settings": {"gaps": "none"}}, "it must be one of error"),
+        ([], {"settings": {"validate": "no.h5"}}, "validate no.h5 does not exist"),
+        ([], {"job": "fit", "settings": {"structure": "arx", "orders": "zz"}}, "'zz' is not NAME=NUMBER"),
+        ([], {"job": "fit", "settings": {"structure": "arxx"}}, "structure 'arxx' is unknown"),
+        (["{folder}/a.toml", "{folder}/b.toml"], {"ledger": "{folder}/no.db"}, "2 of 2 records, the first "),
+        (["{folder}/a.toml"], {"ledger": "{folder}/no.db", "rigs": "{folder}/unnamed.toml"}, "bearing has no name"),
         ([], {"limit_s": math.nan}, "limit_s is nan"),
         ([], {"workers": 0}, "workers is 0"),
     ],
@@ -205,7 +213,28 @@ def test_a_table_that_leaves_something_open_is_refused(folder, tmp_path, table, 
 def test_what_cannot_run_is_refused_before_anything_does(folder, records, more, why):
     given = [r.format(folder=folder) for r in records]
     with pytest.raises(AmbidError, match=why):
-        run_fleet(given, **{k: v.format() if isinstance(v, str) else v for k, v in more.items()})
+        run_fleet(given, **{k: v.format(folder=folder) if isinstance(v, str) else v for k, v in more.items()})
+    assert not (folder / "no.db").exists()
+
+
+def test_what_says_nothing_of_a_record_is_not_remembered(tmp_path):
+    """A time that is lacking fails a job of one's own when it is done; with it the record is done again."""
+    (tmp_path / "1.txt").write_text("1")
+    where = {"ledger": tmp_path / "l.db", "job": judge, "workers": 1}
+    first = run_fleet([tmp_path / "1.txt"], **where)
+    assert "does not say when it was taken" in first.rows[0].reason
+    assert run_fleet([tmp_path / "1.txt"], **where, taken_at="file").counts["done"] == 1
+
+
+def test_the_time_in_a_record_counts(tmp_path):
+    said = replace(ambid.simulate("thesis", duration=0.01, seed=1), provenance={"started": "2026-03-01T06:00"})
+    ambid.write_record(said, tmp_path / "1.h5")
+    ambid.write_record(replace(said, provenance={}), tmp_path / "2.h5")
+    (tmp_path / "3.h5").write_text("damaged")
+    first, damaged = fit_for_ledger(items([tmp_path / "1.h5", tmp_path / "3.h5"], None), strict=True)
+    assert (first.taken_at, damaged.taken_at) == (1772344800.0, None)
+    with pytest.raises(AmbidError, match=r"1 of 2 records, the first .*2.h5, do not say when taken"):
+        fit_for_ledger(items([tmp_path / "1.h5", tmp_path / "2.h5"], None), strict=True)
 
 
 def test_urls_are_fetched(folder, tmp_path):

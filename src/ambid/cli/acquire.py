@@ -36,6 +36,8 @@ def command(v: Values) -> None:
 
     PORT is a serial port, 'emulated' (the firmware on an emulated controller before a simulated bench), 'simulated'
     (a simulated bench alone), or 'replay:FILE'. What is recorded is in a journal at once: see 'ambid recover'.
+    Exit codes, with --track too: 0 done; 2 refused, a fault of the controller, or tracking failed; 3 with --strict a
+    lost sample or poor quality; 130 Ctrl-C.
     """
     from ambid.job.acquiring import Request, acquire, ready
     from ambid.physics.presets import preset_of

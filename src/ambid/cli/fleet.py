@@ -10,7 +10,7 @@ import typer
 
 from ambid.cli.interrupts import Stop, signals
 from ambid.cli.options import Values, verb
-from ambid.cli.output import Outputs, end
+from ambid.cli.output import NOTHING, Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 from ambid.estimation.result import Result
@@ -28,7 +28,9 @@ def run(v: Values) -> None:
     """Do a job on many records, each once, in processes of their own.
 
     A record that ends its worker, or takes too long, is told as failed; all others are done. After Ctrl-C, a crash or
-    a power cut, the same command goes on where it was.
+    a power cut, the same command goes on where it was. Several at a time, also on several machines, share the work.
+    Exit codes: 0 all done; 3 some records failed, or --strict and not usable; 4 none succeeded; 2 refused before
+    anything ran; 130 Ctrl-C.
     """
     from ambid.fleet.run import run_fleet
 
@@ -44,7 +46,8 @@ def run(v: Values) -> None:
                 tick=show, **how,
             )  # fmt: skip
         outputs.give(found)
-    _show(outputs, found, stop, strict=v.strict)
+    n = found.counts
+    _show(outputs, found, stop, strict=v.strict, failed=n["failed"], good=n["done"] + n["known"])
 
 
 @group.command("simulate", short_help="judge a job on many simulated records of a rig")
@@ -53,6 +56,7 @@ def simulate(v: Values) -> None:
     """Judge a job on many simulated records: bias, spread, and how often 95 % intervals hold the truth.
 
     The job gets the rig without the values of parameters that are free. Ctrl-C keeps what is done.
+    Exit codes as of 'ambid fleet run': 3 some runs failed, 4 all did.
     """
     from ambid.fleet.trials import monte_carlo
 
@@ -65,15 +69,18 @@ def simulate(v: Values) -> None:
                 **v.only("runs seed job workers limit_s"), **_settings(v.set),
             )  # fmt: skip
         outputs.give(found)
-    _show(outputs, found, stop, strict=v.strict)
+    failed = found.counts["failed"]
+    _show(outputs, found, stop, strict=v.strict, failed=failed, good=len(found.trials) - failed)
 
 
-def _show(outputs: Outputs, found: Result, stop: Stop, *, strict: bool) -> None:
-    """Print what was found, and end with the code of the signal where one ended the work."""
+def _show(outputs: Outputs, found: Result, stop: Stop, *, strict: bool, failed: int, good: int) -> None:
+    """Print what was found, and end with the code of the signal where one ended the work, or of what failed."""
     outputs.show(found)
     if stop.wished():
         raise typer.Exit(stop.code)
-    end(failed=strict and not found.passed)
+    if failed and not good:
+        raise typer.Exit(NOTHING)
+    end(failed=bool(failed) or (strict and not found.passed))
 
 
 def _settings(words: list[str] | None) -> dict[str, Any]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ambid.rig import Rig
 
 FAILED_CHECK = 3
+NOTHING = 4  # of many, none succeeded
 _FILE = "file"  # the word for the time of the record's file
 
 

@@ -116,10 +116,9 @@ class _Display:
     def tick(self, stage: str, done: float | None = None, /) -> None:
         self._stage, self._count = stage, self._count + 1 if stage == self._stage else 1
         if done is not None:
-            self._told = True
+            self._told, self._share = True, min(max(done, 0.0), 1.0)
         elif self._count >= _FEWEST and not self._told:
-            done = guessed(self._count, _EXPECTED)
-        self._share = max(self._share, min(done or 0.0, 1.0))
+            self._share = max(self._share, guessed(self._count, _EXPECTED))
 
     def stop(self) -> None:
         self._done.set()

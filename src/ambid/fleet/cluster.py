@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from threading import Timer
 from typing import Any
@@ -17,7 +18,9 @@ from ambid.fleet.pool import Done, attempt, one_thread_each
 from ambid.settings.caller import Language, language, setting, speaking
 
 ALLOWED_FAILURES = 2  # workers that a task may have killed before it is held to be poison
-_AHEAD = 3  # tasks on their way for each worker
+_AHEAD = 3  # batches on their way for each worker
+_BATCH_S, _BATCH = 0.25, 64  # a batch takes about so long, and has at most so many tasks
+_END = object()
 _GONE_S = 30.0  # without a worker, after which a cluster on this machine gets new ones
 _LOOK_S = 0.2  # how often a wait looks whether it should end
 
@@ -52,19 +55,30 @@ def _answers(
     distributed: Any, client: Any, job: Any, tasks: Iterator[Any], limit_s: float, stopped: Callable[[], bool]
 ) -> Iterator[Done]:
     suspects: deque[Any] = deque()
-    on_their_way: dict[Any, tuple[Any, bool]] = {}  # with whether they are run alone
+    on_their_way: dict[Any, tuple[list[Any], bool]] = {}  # with whether they are run alone
+    mean_s, more = 1.0, True
+
+    def send(some: list[Any], *, alone: bool) -> None:
+        future = client.submit(timed, job, some, limit_s, language(), pure=False, retries=0)
+        on_their_way[future] = (some, alone)
+
     last_s = time.monotonic()  # when there was a worker
     n_workers = 0 if client.cluster is None else len(client.cluster.worker_spec)
     while True:
         room = _AHEAD * max(1, len(client.nthreads() or (1,))) - len(on_their_way)
-        while room > 0 and (task := next(tasks, None)) is not None:
-            future = client.submit(timed, job, task, limit_s, language(), pure=False, retries=0)
-            on_their_way[future], room = (task, False), room - 1
+        while more and room > 0:
+            some, more = _drawn(tasks, max(1, min(_BATCH, int(_BATCH_S / mean_s))))
+            if not some:
+                break
+            send(some, alone=False)
+            room -= 1
         if not on_their_way and suspects:
-            task = suspects.popleft()
-            on_their_way[client.submit(timed, job, task, limit_s, language(), pure=False, retries=0)] = (task, True)
-        if not on_their_way or stopped():
+            send([suspects.popleft()], alone=True)
+        if stopped() or not (on_their_way or more):
             return
+        if not on_their_way:
+            time.sleep(_LOOK_S)
+            continue
         try:
             ready = distributed.wait(list(on_their_way), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
@@ -78,33 +92,49 @@ def _answers(
                     last_s = time.monotonic()
             continue
         for future in ready:
-            task, alone = on_their_way.pop(future)
+            some, alone = on_their_way.pop(future)
             if future.status == "finished":
-                done = future.result()
-                yield Done(task=task, value=done.value, failure=done.failure, seconds=done.seconds)
+                for task, done in zip(some, future.result(), strict=True):
+                    mean_s = 0.8 * mean_s + 0.2 * done.seconds
+                    yield replace(done, task=task)
                 continue
             failure = future.exception()
             if not isinstance(failure, distributed.scheduler.KilledWorker):
-                yield Done(task=task, failure=f"a defect: {type(failure).__name__}: {' '.join(str(failure).split())}")
+                text = f"a defect: {type(failure).__name__}: {' '.join(str(failure).split())}"
+                yield from (Done(task=task, failure=text) for task in some)
             elif alone:
                 text = f"killed {ALLOWED_FAILURES + 1} workers when run alone, or took longer than {limit_s:g} s"
-                yield Done(task=task, failure=text)
+                yield from (Done(task=task, failure=text) for task in some)
             else:
-                suspects.append(task)
+                suspects.extend(some)
 
 
-def timed(job: Callable[[Any], Any], task: Any, limit_s: float, caller: Language) -> Done:
-    """Do a task in a worker of the cluster; one that takes too long ends the worker; `caller`: who reads messages."""
+def _drawn(tasks: Iterator[Any], most: int) -> tuple[list[Any], bool]:
+    """Return tasks as far as there are some at present, and whether more may come."""
+    some: list[Any] = []
+    while len(some) < most:
+        task = next(tasks, _END)
+        if task is None or task is _END:
+            return some, task is None
+        some.append(task)
+    return some, True
+
+
+def timed(job: Callable[[Any], Any], some: list[Any], limit_s: float, caller: Language) -> list[Done]:
+    """Do tasks in a worker of the cluster; one that takes too long ends the worker; `caller`: who reads messages."""
     from os import _exit
 
-    watch = Timer(limit_s, _exit, (1,))
-    watch.daemon = True
-    watch.start()
-    try:
-        with speaking(caller):
-            return attempt(job, task)
-    finally:
-        watch.cancel()
+    answers = []
+    for task in some:
+        watch = Timer(limit_s, _exit, (1,))
+        watch.daemon = True
+        watch.start()
+        try:
+            with speaking(caller):
+                answers.append(attempt(job, task))
+        finally:
+            watch.cancel()
+    return answers
 
 
 @contextmanager

@@ -18,8 +18,8 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from itertools import count, islice
+from dataclasses import dataclass, field, replace
+from itertools import count
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -27,7 +27,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ambid.compiled import THREADS
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, CircumstanceError
 from ambid.settings.caller import Language, language, speaking
 from ambid.tracking.engine import ignoring_interrupts
 
@@ -37,6 +37,9 @@ _CHUNK_S, _CHUNK = 0.02, 64  # a chunk takes about so long, and has at most so m
 _LOOK_S = 0.2  # how often a wait looks whether it should end
 _PATIENCE_S = 2.0  # for a worker that was told to end
 _STILLBORN = 3  # workers in a row that died before they began
+
+
+_ATTEMPTS = count()  # of this process
 
 
 def _read_only(mapping: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -54,6 +57,8 @@ class Done:
     value: Any = None
     failure: str | None = None
     seconds: float = 0.0
+    lasting: bool = True  # whether another run would fail likewise
+    first: bool = False  # of its process: it also loads what all need
 
 
 def cores() -> int:
@@ -63,16 +68,19 @@ def cores() -> int:
 
 def attempt(job: Callable[[Any], Any], task: Any) -> Done:
     """Do a task here, and keep why it cannot be done."""
-    begin, value, failure = time.perf_counter(), None, None
+    begin, value, failure, lasting = time.perf_counter(), None, None, True
     try:
         value = job(task)
     except AmbidError as refusal:
-        failure = str(refusal)
+        failure, lasting = str(refusal), not isinstance(refusal, CircumstanceError)
     except MemoryError:
-        failure = "out of memory"
+        failure, lasting = "out of memory", False
     except Exception as defect:
         failure = f"a defect: {type(defect).__name__}: {' '.join(str(defect).split())}"
-    return Done(task=None, value=value, failure=failure, seconds=time.perf_counter() - begin)
+    return Done(
+        task=None, value=value, failure=failure, seconds=time.perf_counter() - begin, lasting=lasting,
+        first=next(_ATTEMPTS) == 0,
+    )  # fmt: skip
 
 
 def work(
@@ -85,9 +93,9 @@ def work(
 ) -> Generator[Done, None, None]:
     """Do each task in one of several processes, and yield it as soon as it is done, in no certain order.
 
-    `job`: can be pickled, as must be tasks and values; `workers`: processes, by default as many as there are
-    processors; `limit_s`: after which a task is given up and its worker killed; `stopped`: asked now and then; true
-    ends the work after what is done already.
+    `job`: can be pickled, as must be tasks and values; `tasks`: None among them: nothing at present; `workers`:
+    processes, by default as many as there are processors; `limit_s`: after which a task is given up and its worker
+    killed; `stopped`: asked now and then; true ends the work after what is done already.
     """
     try:
         packed = pickle.dumps(job)
@@ -135,6 +143,7 @@ class _Pool:
         self._deaths: dict[int, int] = {}  # of suspects that were run alone
         self._workers: list[_Worker] = []
         self._mean_s, self._stillborn = 1.0, 0
+        self._more = True  # whether tasks may still come
 
     def answers(self, stopped: Callable[[], bool]) -> Iterator[Done]:
         """Yield every task when it is done."""
@@ -143,8 +152,11 @@ class _Pool:
             if not ending:
                 self._give()
             busy = [w for w in self._workers if w.given or not w.ready]
-            if not busy:
+            if not busy and (ending or not self._more):
                 return
+            if not busy:
+                time.sleep(_LOOK_S)
+                continue
             for line in wait([w.line for w in busy], 0.0 if ending else self._patience(busy)):
                 yield from self._hear(next(w for w in busy if w.line is line))
             if ending:
@@ -167,7 +179,7 @@ class _Pool:
             self._send(worker, self._next(max(1, min(_CHUNK, int(_CHUNK_S / self._mean_s)))))
         coming = sum(not w.ready for w in self._workers)
         while len(self._workers) < self._size and not (coming and self._stillborn):
-            self._waiting.extend(islice(self._tasks, max(0, coming + 1 - len(self._waiting))))
+            self._waiting.extend(self._draw(coming + 1 - len(self._waiting)))
             if len(self._waiting) <= coming:
                 break
             self._start()
@@ -182,7 +194,20 @@ class _Pool:
     def _next(self, most: int) -> list[tuple[int, Any]]:
         """Take tasks from what waits, then from what comes."""
         tasks = [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
-        return tasks or list(islice(self._tasks, most))
+        return tasks or self._draw(most)
+
+    def _draw(self, most: int) -> list[tuple[int, Any]]:
+        """Take tasks from what comes, as far as there are some at present."""
+        drawn: list[tuple[int, Any]] = []
+        while self._more and len(drawn) < most:
+            numbered = next(self._tasks, None)
+            if numbered is None:
+                self._more = False
+            elif numbered[1] is None:
+                break
+            else:
+                drawn.append(numbered)
+        return drawn
 
     def _start(self) -> None:
         context = get_context("spawn")
@@ -218,7 +243,7 @@ class _Pool:
                 _, task = worker.given.popleft()
                 worker.since = time.monotonic()
                 self._mean_s = 0.8 * self._mean_s + 0.2 * message.seconds
-                yield Done(task=task, value=message.value, failure=message.failure, seconds=message.seconds)
+                yield replace(message, task=task)
         except (EOFError, OSError):
             self._workers.remove(worker)
             yield from self._bury(worker, _cause(worker.gone()))

@@ -11,21 +11,24 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import AmbidError, choices
+from ambid.errors import AmbidError, CircumstanceError, choices, counted
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
+from ambid.fleet.pace import Pace
 from ambid.fleet.pool import LIMIT_S, Done, cores, work
-from ambid.fleet.sources import Item, Rigs, items
+from ambid.fleet.sources import Item, Rigs, fit_for_ledger, items, started_in, undated
 from ambid.job.results import result_of
-from ambid.ledger.entry import Entry, entry_of, key_of, rig_sha_of, settings_text, sha_of
+from ambid.ledger.entry import Entry, entry_of, installed, key_of, moment, rig_sha_of, settings_text, sha_of
+from ambid.ledger.leases import Leases
 from ambid.ledger.store import Failure, FleetRow, FleetRun, Ledger, open_ledger
 from ambid.record import Source
+from ambid.rig import default_rig
 from ambid.settings.caller import check_positive, check_whole, setting
+from ambid.settings.jobs import JOBS as SETTINGS_OF
 
 if TYPE_CHECKING:
     import pandas
@@ -34,7 +37,9 @@ JOBS = ("identify", "identify_nonlinear", "fit", "frf", "info", "margins", "vali
 """Jobs by name: functions of `ambid` that take one record."""
 
 _OWN = ("record", "records", "rig", "tick", "units")  # arguments that are no settings
-_ASKED = 200  # keys that a ledger is asked for at once
+_ASKED, _ASKED_S = 200, 0.25  # keys that a ledger is asked for at once, and for how long they are looked up
+_PORTION_S = 1.0  # work that is taken in hand together, where several runs share a list
+_LOOK_S = 0.5  # how often it is looked what other runs have done
 _STORE_S = 0.25  # results of so long are stored together
 _MOST = 500
 _WORKERS = 1024  # at most
@@ -50,6 +55,7 @@ class _Task:
     item: Item
     sha: str = ""
     rig_sha: str = ""
+    key: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,21 +84,30 @@ class JobOf:
 
     def __call__(self, task: _Task) -> _Found:
         """Do one record."""
-        item = task.item
+        item, when = task.item, task.item.when() if self.stored else None
         with item.here(task.sha) as record:
+            if self.stored and when is None and item.remote:  # what lies here was looked at before
+                said = started_in(record)
+                if said == "" and isinstance(self.job, str):
+                    raise CircumstanceError(undated([item], 1))
+                when = moment(said, f"the time in {item.name}") if said else None
             result = self.of(record, item.rig)
-        entry = None
-        if self.stored:
-            from ambid.job.presentation import document
+        values, units = numbers_of(result)
+        entry = self._entry(result, task, when) if self.stored else None
+        return _Found(judged=_judged(result), values=values, units=units, entry=entry)
 
-            if not isinstance(result, Result):
-                raise AmbidError(f"{self.name} gives no result that a ledger keeps. Run it without one")
-            entry = entry_of(
-                result, bearing=item.bearing, taken_at=item.when(), sha=task.sha, rig=item.rig, settings=self.said,
+    def _entry(self, result: Any, task: _Task, when: float | None) -> Entry:
+        from ambid.job.presentation import document
+
+        if not isinstance(result, Result):
+            raise CircumstanceError(f"{self.name} gives no result that a ledger keeps. Run it without one")
+        try:
+            return entry_of(
+                result, bearing=task.item.bearing, taken_at=when, sha=task.sha, rig=task.item.rig, settings=self.said,
                 job=self.name, document=document(result) if isinstance(self.job, str) else "",
             )  # fmt: skip
-        values, units = numbers_of(result)
-        return _Found(judged=_judged(result), values=values, units=units, entry=entry)
+        except AmbidError as refusal:  # of bearing or time: the record was done
+            raise CircumstanceError(str(refusal)) from None
 
     def of(self, record: Any, rig: Any) -> Any:
         """Return what the job gives."""
@@ -125,6 +140,8 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
         lacks = [n for n in takes if n not in settings and parameters[n].default is inspect.Parameter.empty]
         if lacks:
             raise AmbidError(f"{job} needs {lacks[0]}. Give {setting('set', f'{lacks[0]}=…')}")
+        if settings:
+            _check_settings(job, settings)
     values = {n: f"{x} {sha_of(Path(x))}" if isinstance(x, (str, Path)) and Path(x).is_file() else x
             for n, x in settings.items()}  # fmt: skip
     if not isinstance(job, str):  # another function under the same name is another job; what it calls is not seen
@@ -132,6 +149,23 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
             values["its code"] = hashlib.sha256(inspect.getsource(job).encode()).hexdigest()[:16]
     result = JobOf(job=job, settings=dict(settings), said="", stored=stored)
     return JobOf(job=job, settings=dict(settings), said=settings_text(result.name, **values), stored=stored)
+
+
+def _check_settings(job: str, settings: Mapping[str, Any]) -> None:
+    """Refuse settings that no record can make good: by their ranges, and by what the job says to a record that is not
+    there.
+    """
+    declared = SETTINGS_OF["identify" if job == "identify_nonlinear" else job]
+    declared.check(settings.items())
+    for name in (s.name for s in declared.settings if s.kind == "path"):
+        if name in settings and not Path(str(settings[name])).is_file():
+            raise AmbidError(f"{name} {settings[name]} does not exist. Check the path")
+    absent = Path(__file__).with_name("no record.h5")
+    try:
+        JobOf(job=job, settings=settings, said="").of(absent, default_rig())
+    except AmbidError as refusal:
+        if str(absent) not in str(refusal):
+            raise
 
 
 def numbers_of(result: Any) -> tuple[dict[str, tuple[float | None, float | None]], dict[str, str]]:
@@ -164,46 +198,139 @@ def _judged(result: Any) -> dict[str, Any]:
 class _Run:
     """A fleet at work: rows that are there, and what is to be stored."""
 
-    def __init__(self, job: JobOf, fleet: Sequence[Item], ledger: Ledger | None, *, again: bool) -> None:
-        self.job, self.fleet, self.ledger = job, fleet, ledger
+    def __init__(self, job: JobOf, fleet: Sequence[Item], ledger: Ledger | None, *, again: bool, workers: int) -> None:
+        self.job, self.fleet, self.ledger, self.workers = job, fleet, ledger, workers
         self.rows: dict[int, FleetRow] = {}
         self.units: dict[str, str] = {}
         self.counts = Counter[str]()
-        self._failed = {} if ledger is None or again else ledger.failures()
+        self.pace = Pace([item.size for item in fleet], workers)
+        self._leases = None if ledger is None else Leases(ledger)
+        self._again = again
+        self._failed = {} if ledger is None else ledger.failures()  # before this run
         self._first: dict[str, int] = {}  # of each key, the record that is done for it
         self._same: dict[int, list[tuple[int, Item]]] = {}  # and others of the same contents
+        self._elsewhere: dict[str, _Task] = {}  # what other runs have in hand, by key
+        self._look_at = 0.0  # when it is looked what became of that
+        self._reached = 0
         self._rigs = {id(i.rig): rig_sha_of(i.rig) for i in {id(i.rig): i for i in fleet}.values()} if ledger else {}
         self._entries: list[Entry] = []
         self._failures: list[Failure] = []
-        self._stored = time.monotonic()
+        self._fruitless: list[str] = []  # keys of what failed by circumstances
+        self._stored = self._begin = time.monotonic()
 
-    def tasks(self) -> Iterator[_Task]:
-        """Yield what is not known yet."""
-        coming = iter(enumerate(self.fleet))
-        while some := list(islice(coming, _ASKED)):
-            if self.ledger is None:
-                yield from (_Task(at=at, item=item) for at, item in some)
+    def tasks(self) -> Iterator[_Task | None]:
+        """Yield what is not known yet and nobody else has in hand; None: others still have some that may come back."""
+        if self.ledger is None:
+            yield from (_Task(at=at, item=item) for at, item in enumerate(self.fleet))
+            return
+        coming = self._unknown(self.ledger)
+        while some := list(islice(coming, self._portion())):
+            yield from self._taken(some)
+            self._adopt()
+        while self._elsewhere:
+            if time.monotonic() < self._look_at:
+                yield None
                 continue
-            keyed = {}
-            for at, item in some:
-                try:
-                    task = _Task(at=at, item=item, sha=item.digest(), rig_sha=self._rigs[id(item.rig)])
-                except AmbidError as refusal:
-                    self.put(at, item, "failed", reason=str(refusal))
-                    continue
-                keyed[at] = (key_of(task.sha, task.rig_sha, self.job.said), task)
-            done = self.ledger.documents(key for key, _ in keyed.values())
-            for at, (key, task) in keyed.items():
-                if key in done:
-                    self.put(at, task.item, "known", **self.kept(*done[key]))
-                elif key in self._first:
-                    self._same.setdefault(self._first[key], []).append((at, task.item))
-                    self._like(self._first[key])
-                elif key in self._failed:
-                    self.put(at, task.item, "failed", reason=self._failed[key].reason)
+            self._adopt()
+            yield from self._taken([*self._elsewhere.values()])
+
+    def _portion(self) -> int:
+        """Return how many records are taken in hand together: about a second's work, fewer towards the end."""
+        rate = self.counts["done"] / (time.monotonic() - self._begin)
+        return max(self.workers, min(int(rate * _PORTION_S), (len(self.fleet) - self._reached) // 8, _ASKED))
+
+    def _unknown(self, ledger: Ledger) -> Iterator[_Task]:
+        """Yield the records of which the ledger knows nothing, the first of each contents."""
+        coming, more = iter(enumerate(self.fleet)), True
+        while more:
+            some, end = list[_Task](), time.monotonic() + _ASKED_S
+            while more and len(some) < _ASKED and time.monotonic() < end:
+                at, item = next(coming, (0, None))
+                more = item is not None
+                task = self._keyed(at, item) if item is not None else None
+                if task is not None:
+                    some.append(task)
+            known = ledger.documents(task.key for task in some)
+            for task in some:
+                self._reached = task.at
+                before = None if self._again else self._failed.get(task.key)
+                if task.key in known:
+                    self.put(task.at, task.item, "known", **self.kept(*known[task.key]))
+                elif before is not None:
+                    self.put(task.at, task.item, "failed", reason=before.reason)
                 else:
-                    self._first[key] = at
                     yield task
+                self._like(task.at)
+
+    def _keyed(self, at: int, item: Item) -> _Task | None:
+        """Return a record with its key; None where it cannot be read, or another one holds the same."""
+        try:
+            sha, rig_sha = item.digest(), self._rigs[id(item.rig)]
+        except AmbidError as refusal:
+            self.put(at, item, "failed", reason=str(refusal))
+            return None
+        key = key_of(sha, rig_sha, self.job.said)
+        first = self._first.setdefault(key, at)
+        if first != at:
+            self._same.setdefault(first, []).append((at, item))
+            self._like(first)
+            return None
+        return _Task(at=at, item=item, sha=sha, rig_sha=rig_sha, key=key)
+
+    def _taken(self, some: Sequence[_Task]) -> list[_Task]:
+        """Return those that are this run's now, and nobody has done meanwhile; keep the others in mind."""
+        if not some:
+            return []
+        assert self._leases is not None
+        mine = self._leases.take({task.key: task.item.name for task in some})
+        for task in some:
+            if task.key in mine:
+                self._elsewhere.pop(task.key, None)
+            else:
+                self._elsewhere[task.key] = task
+        return self._open([task for task in some if task.key in mine])
+
+    def _adopt(self) -> None:
+        """Put down what other runs have done meanwhile of what they had in hand."""
+        if self._elsewhere and time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + _LOOK_S
+            left = self._open([*self._elsewhere.values()])
+            self._elsewhere = {task.key: task for task in left}
+
+    def _open(self, some: Sequence[_Task]) -> list[_Task]:
+        """Return the records that no run has brought to an end, and put down the others."""
+        if not some:
+            return []
+        assert self.ledger is not None
+        assert self._leases is not None
+        known, left, over = self.ledger.documents(task.key for task in some), list[_Task](), list[str]()
+        failed = self.ledger.failures(task.key for task in some if task.key not in known)
+        for task in some:
+            before, now = self._failed.get(task.key), failed.get(task.key)
+            if task.key in known:
+                self.put(task.at, task.item, "known", **self.kept(*known[task.key]))
+            elif now is not None and now != before:
+                self.put(task.at, task.item, "failed", reason=now.reason)
+            else:
+                left.append(task)
+                continue
+            over.append(task.key)
+            self._like(task.at)
+        self._leases.release(over)
+        return left
+
+    def alive(self) -> None:
+        """Say that this run is at work; called often."""
+        if self._leases is not None:
+            self._leases.beat()
+
+    def end(self) -> None:
+        """Store what has come, and give back what has not."""
+        try:
+            self.store()
+        finally:
+            if self._leases is not None:
+                self._leases.close()
 
     def kept(self, status: str, verdict: str, failed: str, text: str) -> dict[str, Any]:
         """Return the fields of a row whose result the ledger keeps."""
@@ -215,19 +342,23 @@ class _Run:
     def put(self, at: int, item: Item, state: Any, **more: Any) -> None:
         """Put down what is known of a record."""
         self.counts[state] += 1
+        self.pace.over(item.size)
         self.rows[at] = FleetRow(
             record=item.name, bearing=item.bearing, rig=item.rig.name, taken_at=item.taken_at, state=state,
             **{"values": {}, **more},
         )  # fmt: skip
 
-    def said(self, rate: float) -> str:
-        """Say how it goes."""
-        failed = self.counts["failed"]
-        return f"{rate:.3g} records/s" + (f", {failed} failed" if failed else "")
+    def tell(self, n: int, say: Tick) -> None:
+        """Tell how it goes, after so many answers."""
+        failed, others = self.counts["failed"], 0 if self._leases is None else self._leases.others
+        rate = n / max(time.monotonic() - self._begin, 1e-9)
+        beside = f", {counted(others, 'other run')} beside" if others else ""
+        say(f"{rate:.3g} records/s{f', {failed} failed' if failed else ''}{beside}", self.pace.share(1 + others))
 
     def take(self, done: Done) -> None:
         """Take the answer to a record."""
         task: _Task = done.task
+        self.pace.take(task.item.size, done.seconds, first=done.first)
         if done.failure is None:
             outcome: _Found = done.value
             self.units |= outcome.units
@@ -237,13 +368,15 @@ class _Run:
                 self._entries.append(outcome.entry)
         else:
             self.put(task.at, task.item, "failed", reason=done.failure, seconds=done.seconds)
-            if task.sha:
+            if task.sha and done.lasting:
                 self._failures.append(
                     Failure(
                         bearing=task.item.bearing, record=task.item.name, sha=task.sha, rig_sha=task.rig_sha,
-                        settings=self.job.said, version=version("ambid"), reason=done.failure,
+                        settings=self.job.said, version=installed("ambid"), reason=done.failure,
                     )
                 )  # fmt: skip
+            else:
+                self._fruitless.append(task.key)
         self._like(task.at)
         if time.monotonic() - self._stored > _STORE_S or len(self._entries) >= _MOST:
             self.store()
@@ -259,12 +392,15 @@ class _Run:
             self.put(at, item, "known" if row.state == "done" else row.state, reason=reason, **same)
 
     def store(self) -> None:
-        """Store what has come since the last time."""
-        if self.ledger is not None:
+        """Store what has come since the last time, and give it back."""
+        if self.ledger is not None and self._leases is not None:
             self.ledger.add(self._entries)
-            if self._failures:
-                self.ledger.fail(self._failures)
-        self._entries, self._failures, self._stored = [], [], time.monotonic()
+            there = self.ledger.documents(f.key for f in self._failures)  # by a run that took a lease over
+            failures = [f for f in self._failures if f.key not in there]
+            if failures:
+                self.ledger.fail(failures)
+            self._leases.release([e.key for e in self._entries] + [f.key for f in self._failures] + self._fruitless)
+        self._entries, self._failures, self._fruitless, self._stored = [], [], [], time.monotonic()
 
 
 def run_fleet(
@@ -289,30 +425,38 @@ def run_fleet(
     local = _local(scheduler)
     job_made = job_of(job, settings or {}, stored=ledger is not None)
     fleet, begin, say = items(records, rigs, taken_at), time.monotonic(), tick or silent
+    if ledger is not None:
+        fleet = fit_for_ledger(fleet, strict=isinstance(job, str))
+    n_workers = local or workers or cores()
     store = None if ledger is None else open_ledger(ledger)
     try:
-        run = _Run(job_made, fleet, store, again=again)
+        run = _Run(job_made, fleet, store, again=again, workers=n_workers)
+
+        def wished() -> bool:
+            run.alive()
+            return stopped()
+
         if scheduler is None:
-            answers = work(job_made, run.tasks(), workers=workers, limit_s=limit_s, stopped=stopped)
+            answers = work(job_made, run.tasks(), workers=workers, limit_s=limit_s, stopped=wished)
         else:
             from ambid.fleet.cluster import work_on_cluster
 
             answers = work_on_cluster(
-                job_made, run.tasks(), scheduler=local or scheduler, limit_s=limit_s, stopped=stopped
+                job_made, run.tasks(), scheduler=local or scheduler, limit_s=limit_s, stopped=wished
             )
         try:
             for n, done in enumerate(answers, 1):
                 run.take(done)
-                say(run.said(n / max(time.monotonic() - begin, 1e-9)), len(run.rows) / len(fleet))
+                run.tell(n, say)
         finally:
             answers.close()
-            run.store()
+            run.end()
     finally:
         if store is not None:
             store.close()
     return FleetRun(
         job=job_made.name, settings=job_made.said, ledger=None if store is None else store.shown,
-        workers=local or workers or cores(), seconds=time.monotonic() - begin, records=len(fleet), units=run.units,
+        workers=n_workers, seconds=time.monotonic() - begin, records=len(fleet), units=run.units,
         rows=tuple(run.rows[at] for at in sorted(run.rows)),
     )  # fmt: skip
 

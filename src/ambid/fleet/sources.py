@@ -9,7 +9,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,7 +18,9 @@ from ambid.errors import AmbidError, RecordError, counted, needs
 from ambid.job.data import known_rig
 from ambid.ledger.entry import moment, sha_of
 from ambid.record import Record, Source, read_record
+from ambid.record.hdf5_format import started_of
 from ambid.rig import Rig
+from ambid.settings.caller import setting
 
 _WORD = re.compile(r"\{(\w+)\}")
 _WILD = re.compile(r"[*?\[{]")
@@ -38,6 +40,7 @@ class Item:
     bearing: str
     taken_at: float | None  # s since 1970, UTC; None: the record says so itself
     by_file: bool = False  # whether the time of its file counts instead
+    size: float = 1.0  # by which it takes longer than another one
 
     @property
     def remote(self) -> bool:
@@ -136,10 +139,58 @@ def items(records: Source | Sequence[Source], rigs: Rigs, taken_at: str | None =
                 Item(
                     source=one, name=name, rig=loaded[rig_key], bearing=bearing or loaded[rig_key].name,
                     taken_at=None if at in (None, "file") else moment(str(at), f"taken_at of {name}"),
-                    by_file=at == "file",
+                    by_file=at == "file", size=_size(one),
                 )
             )  # fmt: skip
     return result
+
+
+def fit_for_ledger(fleet: Sequence[Item], *, strict: bool) -> list[Item]:
+    """Return the records with the time that each says itself, where nothing else says it; refuse what no ledger keeps.
+
+    `strict`: also records that do not say it; what lies elsewhere is looked at when it is here.
+    """
+    dated, lacking = list[Item](), list[Item]()
+    for item in fleet:
+        if not item.bearing.strip():
+            raise AmbidError(f"record {item.name}: its bearing has no name. Name it in the table or in the rig")
+        silent = item.taken_at is None and (isinstance(item.source, Record) or not (item.by_file or item.remote))
+        said = started_in(item.source) if silent else None
+        if said == "":
+            lacking.append(item)
+        dated.append(replace(item, taken_at=moment(said, f"the time in {item.name}")) if said else item)
+    if lacking and strict:
+        raise AmbidError(undated(lacking, len(fleet)))
+    return dated
+
+
+def started_in(record: Any) -> str | None:
+    """Return when a record in memory, or in a file here, says that it was taken; empty where it does not; None where
+    the file cannot be read, as the job will tell.
+    """
+    if isinstance(record, Record):
+        return record.provenance.get("started", "")
+    return started_of(Path(record)) if Path(record).suffix.lower() in (".h5", ".hdf5") else ""
+
+
+def undated(lacking: Sequence[Item], n: int) -> str:
+    """Return the refusal of records of which nobody says when they were taken."""
+    first = lacking[0].name
+    who = f"record {first} does" if n == 1 else f"{len(lacking)} of {counted(n, 'record')}, the first {first}, do"
+    return (
+        f"{who} not say when taken, and the ledger has to know. Give {setting('taken_at', 'TIME')}, "
+        f"{setting('taken_at', 'file')} for the time of the file, or name records by {{taken_at}}"
+    )
+
+
+def _size(source: Any) -> float:
+    """Return how large a record is; one that is not of this machine as any other."""
+    if isinstance(source, Record):
+        return float(source.n_samples * len(source.channels))
+    try:
+        return 1.0 if "://" in str(source) else float(Path(source).stat().st_size)
+    except OSError:
+        return 1.0
 
 
 def _matches(source: Any) -> Iterator[tuple[Any, dict[str, str]]]:

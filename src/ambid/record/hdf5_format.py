@@ -207,6 +207,16 @@ def is_own(path: Path) -> bool:
         return True
 
 
+def started_of(path: Path) -> str | None:
+    """Return when a file says that its record was taken; empty where it does not, None where it cannot be read."""
+    try:
+        with hdf5_of(path) as file:
+            said = json.loads(file["provenance"].asstr()[()]) if "provenance" in file else {}
+    except (RecordError, OSError, RuntimeError, ValueError, TypeError, AttributeError):
+        return None
+    return str(said.get("started") or "") if isinstance(said, dict) else None
+
+
 def read_hdf5(path: str | Path) -> Record:
     """Read a record of layout ``ambid.record/1``, bit for bit as written; ``file`` and ``sha256`` in the provenance are
     of this file where the record had none.
