@@ -1,7 +1,7 @@
 """Two runs that share one list by leases: the time against one run alone, and each record once under random kills.
 
 ``PYTHONPATH=. python bench/fleet_shared.py [RECORDS] [KILLS] [sqlite|postgresql] [wait|compute]``: two processes stand
-for two machines, each with one worker. The job stands for an identification: it takes 0.1 s a record, in which it waits
+for two machines, each with one worker. The job stands for an identification: it takes 0.2 s a record, in which it waits
 (then processors that others use do not count: what is measured is what sharing costs) or computes. Figures are printed;
 none is asserted.
 """
@@ -23,7 +23,7 @@ from typing import Any
 from ambid.ledger import open_ledger
 from tests.fleet.jobs import judge
 
-WORK_S = 0.1
+WORK_S = 0.2
 RUN = """
 import sys
 from ambid.fleet.run import run_fleet
@@ -102,16 +102,14 @@ def main(n: int, kills: int, url: str | None, how: str) -> None:
 
             return new_database(url, name)
 
-        for turn in range(2):  # in turn: the machine may be busy with other things
-            times = {}
-            for runs in (1, 2):
-                name = f"r{turn}{runs}"
-                folder, where = records(n, Path(place) / name), ledger(name)
-                times[runs] = timed(runs, folder, where, how)
-                account(folder, where)
-            share, used = (times[2][k] / times[1][k] for k in (0, 1))
-            print(f"{how}: two runs take {share:.3f} of the time of one, {used:.3f} of its processors' time; load "
-                  f"{os.getloadavg()[0]:.1f} on {os.cpu_count()}", flush=True)  # fmt: skip
+        times = {}
+        for runs in (1, 2):
+            folder, where = records(n, Path(place) / f"r{runs}"), ledger(f"r{runs}")
+            times[runs] = timed(runs, folder, where, how)
+            account(folder, where)
+        share, used = (times[2][k] / times[1][k] for k in (0, 1))
+        print(f"{how}: two runs take {share:.3f} of the time of one, {used:.3f} of its processors' time; load "
+              f"{os.getloadavg()[0]:.1f} on {os.cpu_count()}", flush=True)  # fmt: skip
         folder, where = records(n, Path(place) / "killed"), ledger("killed")
         under_kills(kills, folder, where, how)
         account(folder, where)

@@ -12,7 +12,7 @@ from pathlib import Path
 from table import Table
 
 HERE = Path(__file__).resolve().parent
-SCRIPTS = ("fleet", "ledger", "monitoring", "alarms", "formats", "console")
+SCRIPTS = ("fleet", "fleet_shared", "ledger", "monitoring", "alarms", "formats", "console")
 
 
 def works_tables() -> Iterator[Table]:

@@ -81,7 +81,7 @@ def fleet_sections(fleet: FleetRun) -> list[Section]:
     ]
 
 
-_COUNTED = {"failed": "failed", "known": "known before", "left": "left"}
+_COUNTED = {"failed": "failed", "known": "in the ledger already", "left": "left"}
 
 
 def _values(fleet: FleetRun, name: str) -> tuple[list[int], list[float], list[float]]:
