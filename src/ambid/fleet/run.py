@@ -26,7 +26,7 @@ from ambid.ledger.entry import Entry, entry_of, installed, key_of, moment, rig_s
 from ambid.ledger.leases import Leases
 from ambid.ledger.store import Failure, FleetRow, FleetRun, Ledger, open_ledger
 from ambid.record import Source
-from ambid.rig import default_rig
+from ambid.rig import Rig, default_rig
 from ambid.settings.caller import check_positive, check_whole, setting
 from ambid.settings.jobs import JOBS as SETTINGS_OF
 
@@ -39,6 +39,7 @@ JOBS = ("identify", "identify_nonlinear", "fit", "frf", "info", "margins", "vali
 _OWN = ("record", "records", "rig", "tick", "units")  # arguments that are no settings
 _ASKED, _ASKED_S = 200, 0.25  # keys that a ledger is asked for at once, and for how long they are looked up
 _PORTION_S = 1.0  # work that is taken in hand together, where several runs share a list
+_PROBED = 10  # rigs with which it is asked what a job says to its settings
 _LOOK_S = 0.5  # how often it is looked what other runs have done
 _STORE_S = 0.25  # results of so long are stored together
 _MOST = 500
@@ -140,8 +141,6 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
         lacks = [n for n in takes if n not in settings and parameters[n].default is inspect.Parameter.empty]
         if lacks:
             raise AmbidError(f"{job} needs {lacks[0]}. Give {setting('set', f'{lacks[0]}=…')}")
-        if settings:
-            _check_settings(job, settings)
     values = {n: f"{x} {sha_of(Path(x))}" if isinstance(x, (str, Path)) and Path(x).is_file() else x
             for n, x in settings.items()}  # fmt: skip
     if not isinstance(job, str):  # another function under the same name is another job; what it calls is not seen
@@ -151,21 +150,29 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
     return JobOf(job=job, settings=dict(settings), said=settings_text(result.name, **values), stored=stored)
 
 
-def _check_settings(job: str, settings: Mapping[str, Any]) -> None:
-    """Refuse settings that no record can make good: by their ranges, and by what the job says to a record that is not
-    there.
+def check_settings(job: Job, settings: Mapping[str, Any], rigs: Sequence[Rig]) -> None:
+    """Refuse settings that no record can make good: by their ranges, and by what the job says, whatever the rig, to a
+    record that is not there.
     """
+    if not settings or not isinstance(job, str):
+        return
     declared = SETTINGS_OF["identify" if job == "identify_nonlinear" else job]
     declared.check(settings.items())
     for name in (s.name for s in declared.settings if s.kind == "path"):
         if name in settings and not Path(str(settings[name])).is_file():
             raise AmbidError(f"{name} {settings[name]} does not exist. Check the path")
-    absent = Path(__file__).with_name("no record.h5")
-    try:
-        JobOf(job=job, settings=settings, said="").of(absent, default_rig())
-    except AmbidError as refusal:
-        if str(absent) not in str(refusal):
-            raise
+    absent, refusals = Path(__file__).with_name("no record.h5"), list[AmbidError]()
+    for rig in rigs[:_PROBED] or [default_rig()]:
+        try:
+            JobOf(job=job, settings=settings, said="").of(absent, rig)
+        except AmbidError as refusal:
+            if str(absent) not in str(refusal):
+                refusals.append(refusal)
+                continue
+        except Exception:  # a defect is told of each record
+            pass
+        return
+    raise refusals[0]
 
 
 def numbers_of(result: Any) -> tuple[dict[str, tuple[float | None, float | None]], dict[str, str]]:
@@ -425,6 +432,7 @@ def run_fleet(
     local = _local(scheduler)
     job_made = job_of(job, settings or {}, stored=ledger is not None)
     fleet, begin, say = items(records, rigs, taken_at), time.monotonic(), tick or silent
+    check_settings(job, settings or {}, [*{id(item.rig): item.rig for item in fleet}.values()])
     if ledger is not None:
         fleet = fit_for_ledger(fleet, strict=isinstance(job, str))
     n_workers = local or workers or cores()

@@ -12,7 +12,7 @@ from ambid.errors import AmbidError
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, work
-from ambid.fleet.run import Job, JobOf, job_of, numbers_of
+from ambid.fleet.run import Job, JobOf, check_settings, job_of, numbers_of
 from ambid.job.data import RigSource
 from ambid.job.simulation import bench_of_source, simulate
 from ambid.ledger.entry import settings_text
@@ -114,6 +114,7 @@ def monte_carlo(
             replace(p, value=None) if p.role == "free" and p.name not in places else p for p in truth.parameters
         ),
     )
+    check_settings(job, settings, [known])
     made, given = job_of(job, settings), dict(simulated or {})
     begin, say, trials = time.monotonic(), tick or silent, list[Trial]()
     answers = work(
