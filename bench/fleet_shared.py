@@ -69,11 +69,12 @@ def timed(runs: int, folder: Path, ledger: str, how: str) -> tuple[float, float]
 
 
 def under_kills(kills: int, folder: Path, ledger: str, how: str) -> None:
-    """Kill one of two runs at random again and again, and start it anew at once."""
+    """Kill one of two runs at random again and again while it works, and start it anew at once."""
     rng, killed, begin = random.Random(1), 0, time.perf_counter()
+    pause_s = 0.5 * WORK_S * len([*folder.iterdir()]) / (kills + 2)  # from one to the next
     runs = [start(folder, ledger, how) for _ in range(2)]
     while any(p.poll() is None for p in runs):
-        time.sleep(rng.uniform(1.0, 4.0))
+        time.sleep(pause_s * rng.uniform(0.6, 1.4))
         k = rng.randrange(2)
         if killed < kills and runs[k].poll() is None:
             os.kill(runs[k].pid, signal.SIGKILL)

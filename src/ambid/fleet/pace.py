@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 
 _FEW = 4  # records that tell of no slope
+_KEPT = 0.98  # of what was learnt, with each record: what comes next is like the last fifty
 
 
 class Pace:
@@ -32,7 +33,7 @@ class Pace:
         """Learn from a record that is over."""
         sums = self._first if first else self._sums
         for k, x in enumerate((1.0, size, size * size, seconds, size * seconds, seconds * seconds)):
-            sums[k] += x
+            sums[k] = _KEPT * sums[k] + x
         if first:
             self._since, self._busy_s = time.monotonic(), 0.0
         else:
