@@ -28,6 +28,8 @@ _STANDS_OUT = 60.0  # power of a line over the median of its surroundings from w
 _FORWARD = 4.0  # power of the forward whirl over the backward one, of a line that nobody announced
 _STEPS = 6  # of Gauss-Newton on the phase
 _BINS = 48  # lines of the whole record on either side that show the noise
+_REGULAR = 0.5  # logarithm of the time between pulses over that before and after
+_STEADY = 1.5  # the longest time between pulses over the shortest, up to which the speed is one
 _SMOOTH = 0.15  # rad rms by which pulses may miss a smooth phase
 
 
@@ -107,7 +109,7 @@ def rotation_of(record: Record, model: RotorModel, excitation: Excitation | None
     if "angle" in record:
         return _checked(np.unwrap(record["angle"].values), rate, "angle")
     if "tacho" in record:
-        return _checked(_angle_of_pulses(record["tacho"].values, rate), rate, "tacho")
+        return _checked(angle_of_pulses(record["tacho"].values, rate), rate, "tacho")
     if "speed" in record:
         speed = record["speed"].values
         turned: Array = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))]) / rate
@@ -140,7 +142,7 @@ def _checked(angle: NDArray[np.floating[Any]], rate: float, source: Source) -> R
     )
 
 
-def _angle_of_pulses(x: Array, rate: float) -> Array:
+def angle_of_pulses(x: Array, rate: float) -> Array:
     """Return the angle from pulses once a revolution: zero at every rising edge, smooth between them."""
     low, high = (float(q) for q in np.quantile(x, [0.001, 0.999]))
     if not np.ptp(x) > 0.0:
@@ -161,21 +163,25 @@ def _angle_of_pulses(x: Array, rate: float) -> Array:
         )
     at, turns = np.array(edges), 2.0 * np.pi * np.arange(len(edges))
     gaps = np.diff(at)
-    if gaps.max() > 1.5 * np.median(gaps) or gaps.min() < 0.5 * np.median(gaps):
+    around = np.sqrt(gaps[:-2] * gaps[2:]) if gaps.size > 2 else gaps[:1]  # the speed may change
+    if np.any(np.abs(np.log(gaps[1:-1] / around)) > _REGULAR) or (gaps.size < 3 and np.ptp(gaps) > 0.5 * gaps.max()):
         raise EstimationError(
             f"pulses of channel 'tacho' are {gaps.min() / rate:.4g} s to {gaps.max() / rate:.4g} s apart, as if some "
             "were missing or double. Give one clean pulse in every revolution"
         )
+    place = np.arange(x.size, dtype=np.float64)
+    before, after = np.minimum(place - at[0], 0.0) / gaps[0], np.maximum(place - at[-1], 0.0) / gaps[-1]
+    beyond = 2.0 * np.pi * (before + after)
+    if gaps.max() > _STEADY * gaps.min():  # a run-up or a coast-down
+        from scipy.interpolate import PchipInterpolator
+
+        return np.asarray(PchipInterpolator(at, turns)(np.clip(place, at[0], at[-1])) + beyond)
     half = 0.5 * (x.size - 1)
     smooth = np.polynomial.Polynomial.fit(at / half - 1.0, turns, min(3, len(edges) - 2), domain=[-1.0, 1.0])
     missed = turns - smooth(at / half - 1.0)
     if np.sqrt(np.mean(missed**2)) < _SMOOTH:
-        return np.asarray(smooth(np.arange(x.size) / half - 1.0))
-    inside = np.interp(np.arange(x.size), at, turns)
-    for end, step in ((slice(0, int(at[0]) + 1), gaps[0]), (slice(int(at[-1]), None), gaps[-1])):
-        near = 0 if end.start == 0 else -1
-        inside[end] = turns[near] + 2.0 * np.pi * (np.arange(x.size)[end] - at[near]) / step
-    return np.asarray(inside)
+        return np.asarray(smooth(place / half - 1.0))
+    return np.asarray(np.interp(place, at, turns) + beyond)
 
 
 def _by_lines(

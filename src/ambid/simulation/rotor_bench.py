@@ -4,8 +4,10 @@ zero-order-hold matrices, nonlinear magnets classical Runge-Kutta; unbalance is 
 
 from __future__ import annotations
 
+import cmath
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -37,11 +39,16 @@ from ambid.simulation.plant import (
     signals_fed_back,
 )
 from ambid.simulation.rig_bench import FINE, as_columns, loop_of_rig
+from ambid.simulation.variation import Integers, Schedule
 
 if TYPE_CHECKING:
     from ambid.simulation.kernels import RotorLinear, RotorNonlinear
 
 
+_CHUNK = 16384  # samples whose noise is drawn at once
+_STRETCH = 200  # samples at one speed at most
+_PHASE = 1e-4  # rad by which the angle may leave that of a changing speed inside a stretch
+_NODE = 20.0  # rad/s between speeds with exact matrices
 _SAME = 1e-3  # how well numbers of an axial axis have to agree with those of the cones
 
 
@@ -180,8 +187,13 @@ class Motion:
     command: Array  # (n_samples, n_axes)
     truth: Array  # (n_samples, n_axes + n_currents): what each axis sees of the rotor, then currents
     angle: Array  # (n_samples,), rad
-    counts: NDArray[np.int64]  # first contact, first limited sample (-1: none), limited samples
+    counts: Integers  # first contact, first limited sample (-1: none), limited samples
     lost: int = -1  # first sample that is not finite, or in which a gap closes; -1: none
+    speed: Array | None = None  # (n_samples,), rad/s, where it changes
+
+    def part(self, samples: slice) -> Motion:
+        """Return a view of some samples."""
+        return replace(self, measured=self.measured[samples], command=self.command[samples], truth=self.truth[samples])
 
 
 class _Fixed(NamedTuple):
@@ -191,7 +203,16 @@ class _Fixed(NamedTuple):
     read: Array  # outputs of states
     law: StateLaw | None
     before_line: tuple[Any, Any, Any, Any, Any, Any, Any]  # arguments of the kernel, in its order
-    after_stops: tuple[Array, Array, NDArray[np.int64]]
+    after_stops: tuple[Array, Array, Integers]
+
+    def towards(self, other: _Fixed, share: float) -> _Fixed:
+        """Return what lies between this speed and another; the law is that of this one."""
+        equations, *rest = self.before_line
+        between = tuple(
+            a + share * (b - a) if isinstance(a, np.ndarray) and a.dtype == np.float64 and a.size else a
+            for a, b in zip(equations, other.before_line[0], strict=True)
+        )
+        return self._replace(before_line=(between, *rest))
 
 
 _TOLD = 1e-6  # of the largest singular value, from which commands tell of states
@@ -215,6 +236,7 @@ class RotorBench:
     rate_hz: float
     shapes: Mapping[str, Array]  # what a force in the plane of each unbalance does: (n_coordinates / planes,)
     poles: Poles | None = None  # nonlinear magnets
+    acceleration: float = 0.0  # of the rotation, rad/s²
 
     @classmethod
     def of(cls, rig: Rig, rate_hz: float | None, closed: bool | None, *, nonlinear: bool = False) -> RotorBench:
@@ -301,12 +323,65 @@ class RotorBench:
             )
         at = start if isinstance(start, Running) else self.begun(start)
         moved = self.advance(at, u, np.random.default_rng(seed), load=load)
-        if moved.lost >= 0:
-            place = f"sample {moved.lost - settle} ({(moved.lost - settle) / self.rate_hz:.6g} s)"
-            raise ModelError(
-                f"the simulation closes a gap or diverges at {place}; an unstable plant needs a loop that holds it. "
-                "Give limits.position, or another loop"
-            )
+        self._refuse_lost(moved, settle)
+        return self._logged(moved, u, settle, seed, columns=columns)
+
+    def run_up(self, speed: Schedule, n: int, *, seed: int, settle: int = 0) -> Simulation:
+        """Simulate `n` samples at a speed in rad/s that runs along a schedule, after `settle` samples at its first.
+
+        In stretches at their mean speed that begin at the exact angle; matrices are exact at nodes, linear between.
+        """
+        later = tuple(t + settle / self.rate_hz for t in speed.times_s)
+        course, total = replace(speed, times_s=later), n + settle
+        instants = np.arange(total, dtype=np.float64)
+        w, angle = course.at(instants, self.rate_hz), course.integral(instants, self.rate_hz)
+        moved = self._motion(total, angle)
+        moved.speed = w
+        at, rng, runout = self.begun(), np.random.default_rng(seed), self._runout(angle)
+        still = np.zeros((_CHUNK, len(self.model.inputs)))
+        for first, stop, fixed in self._stretches(w, course):
+            if first % _CHUNK == 0:
+                noise = rng.standard_normal((_CHUNK, fixed.size.size)) * fixed.size
+            if fixed.law is not None and fixed.law is not at.law:
+                at.hand_over(fixed.law, (fixed.read @ at.x)[signals_fed_back(self.model)])
+            at.x[-2:] = math.cos(angle[first]), math.sin(angle[first])
+            part, counts = slice(first, stop), np.array([-1, -1, 0], dtype=np.int64)
+            lost = self._run(at, fixed, still[: stop - first], noise[first % _CHUNK :][: stop - first],
+                             runout[part], moved.part(part), counts)  # fmt: skip
+            for k in (0, 1):
+                moved.counts[k] = first + counts[k] if moved.counts[k] < 0 <= counts[k] else moved.counts[k]
+            moved.counts[2] += counts[2]
+            if lost >= 0:
+                moved.lost = first + lost
+                break
+        self._refuse_lost(moved, settle)
+        return self._logged(moved, None, settle, seed)
+
+    def _stretches(self, w: Array, course: Schedule) -> Iterator[tuple[int, int, _Fixed]]:
+        """Yield stretches of samples in which the speed hardly changes, with what the loop is given in each."""
+        knots = np.clip(course.knots(self.rate_hz).astype(int), 0, w.size)
+        edges = np.unique([0, *knots.tolist(), *range(0, w.size, _CHUNK), w.size]).tolist()
+        for begin, end in itertools.pairwise(edges):
+            slope = (w[end - 1] - w[begin]) / max(end - 1 - begin, 1) * self.rate_hz
+            size = max(1, min(_STRETCH, int(self.rate_hz * math.sqrt(8.0 * _PHASE / max(abs(slope), 1e-9)))))
+            speeds = np.linspace(w[begin], w[end - 1], 2 + int(abs(w[end - 1] - w[begin]) / _NODE))
+            nodes = [replace(self.at_speed(float(x)), acceleration=slope)._fixed for x in speeds]
+            for first in range(begin, end, size):
+                stop = min(first + size, end)
+                middle = float(np.mean(w[first:stop]))
+                k = min(
+                    int(np.searchsorted(np.abs(speeds - speeds[0]), abs(middle - speeds[0]), "right")), speeds.size - 1
+                )
+                share = (middle - speeds[k - 1]) / (speeds[k] - speeds[k - 1]) if speeds[k] != speeds[k - 1] else 0.0
+                yield first, stop, nodes[k - 1].towards(nodes[k], share)
+
+    def at_speed(self, speed: float) -> RotorBench:
+        """Return the bench at another speed, rad/s; its rig has to give what the rotor needs to turn."""
+        return replace(self, plant=replace(self.plant, model=self.model.at_speed(speed)))
+
+    def _logged(self, moved: Motion, u: Array | None, settle: int, seed: int, *, columns: bool = True) -> Simulation:
+        """Return what is logged of a motion, under an excitation if any, after the samples that settle."""
+        rotor = self.model
         names = (
             *(f"{axis}_position" for axis in rotor.axes),
             *(name.replace("_amplifier", "") for name in self._currents),
@@ -341,23 +416,28 @@ class RotorBench:
             largest_pole=self.largest_pole,
         )
 
-    def channels(self, moved: Motion, u: Array, settle: int = 0) -> tuple[Channel, ...]:
+    def channels(self, moved: Motion, u: Array | None, settle: int = 0) -> tuple[Channel, ...]:
         """Return what is logged of a motion under an excitation `u`, after the samples that settle, named by role."""
-        rotor = self.model
+        rotor, roles = self.model, {c.role for c in self.rig.channels}
         values = dict(zip(rotor.inputs, moved.command[settle:].T, strict=True))
         values |= dict(zip(rotor.outputs, moved.measured[settle:].T, strict=True))
-        values |= {f"{axis}_reference": u[settle:, j] for j, axis in enumerate(rotor.axes)}
+        references = {f"{axis}_reference": j for j, axis in enumerate(rotor.axes)}
+        if u is None:  # nothing is excited: columns that the rig names stand at zero
+            values |= {name: np.zeros(moved.angle.size - settle) for name in roles & set(references)}
+        else:
+            values |= {name: u[settle:, j] for name, j in references.items()}
         units = {
             **rotor.units,
-            **dict.fromkeys((f"{axis}_reference" for axis in rotor.axes), rotor.units[rotor.inputs[0]]),
+            **dict.fromkeys(references, rotor.units[rotor.inputs[0]]),
         }
         order = sorted(values, key=lambda name: rotor.axes.index(name.split("_")[0]))  # an axis after the other
         channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
-        roles, angle = {c.role for c in self.rig.channels}, moved.angle[settle:]
+        angle = moved.angle[settle:]
         if rotor.speed or "angle" in roles:  # of a rotor that turns; speed and tacho where the rig names them
             channels.append(Channel(name="angle", unit="rad", values=angle))
-        if "speed" in roles:
-            channels.append(Channel(name="speed", unit="rad/s", values=np.full(angle.size, rotor.speed)))
+        if "speed" in roles or moved.speed is not None:
+            speed = np.full(angle.size, rotor.speed) if moved.speed is None else moved.speed[settle:]
+            channels.append(Channel(name="speed", unit="rad/s", values=speed))
         if "tacho" in roles:  # high in the first tenth of every revolution
             pulses = np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0)
             channels.append(Channel(name="tacho", unit="V", values=pulses))
@@ -376,8 +456,6 @@ class RotorBench:
 
     def advance(self, at: Running, u: Array, rng: np.random.Generator, *, load: Array | None = None) -> Motion:
         """Carry a loop over the samples of an excitation (n_samples, n_axes), in place; `load` as `simulate` has it."""
-        from ambid.simulation.kernels import run_rotor
-
         rotor, n, fixed = self.model, u.shape[0], self._fixed
         disturbed = rng.standard_normal((n, fixed.size.size)) * fixed.size
         if load is not None:
@@ -385,20 +463,40 @@ class RotorBench:
         if fixed.law is not None and fixed.law is not at.law:
             at.hand_over(fixed.law, (fixed.read @ at.x)[signals_fed_back(rotor)])
         turn = rotor.speed / self.rate_hz
-        moved = Motion(
-            measured=np.empty((n, len(rotor.outputs))), command=np.empty((n, u.shape[1])),
-            truth=np.empty((n, len(rotor.axes) + len(self._currents))),
-            angle=np.asarray(at.angle + np.arange(n, dtype=np.float64) * turn),
+        moved = self._motion(n, np.asarray(at.angle + np.arange(n, dtype=np.float64) * turn))
+        at.angle += n * turn
+        moved.lost = self._run(at, fixed, u, disturbed, self._runout(moved.angle), moved, moved.counts)
+        return moved
+
+    def _motion(self, n: int, angle: Array) -> Motion:
+        """Return room for what `n` samples give."""
+        return Motion(
+            measured=np.empty((n, len(self.model.outputs))), command=np.empty((n, len(self.model.inputs))),
+            truth=np.empty((n, len(self.model.axes) + len(self._currents))), angle=angle,
             counts=np.array([-1, -1, 0], dtype=np.int64),
         )  # fmt: skip
-        at.angle += n * turn
-        moved.lost = int(
+
+    def _run(
+        self, at: Running, fixed: _Fixed, u: Array, disturbed: Array, runout: Array, moved: Motion, counts: Integers
+    ) -> int:
+        """Run the compiled loop over some samples; return the first that is lost, -1 for none."""
+        from ambid.simulation.kernels import run_rotor
+
+        return int(
             run_rotor(
-                u, disturbed, self._runout(moved.angle), *fixed.before_line, at.line, self.limits.position,
-                *fixed.after_stops, at.x, at.z, at.memory, moved.counts, moved.measured, moved.command, moved.truth,
+                u, disturbed, runout, *fixed.before_line, at.line, self.limits.position, *fixed.after_stops, at.x,
+                at.z, at.memory, counts, moved.measured, moved.command, moved.truth,
             )
         )  # fmt: skip
-        return moved
+
+    def _refuse_lost(self, moved: Motion, settle: int) -> None:
+        """Refuse a motion that ended before its time."""
+        if moved.lost >= 0:
+            place = f"sample {moved.lost - settle} ({(moved.lost - settle) / self.rate_hz:.6g} s)"
+            raise ModelError(
+                f"the simulation closes a gap or diverges at {place}; an unstable plant needs a loop that holds it. "
+                "Give limits.position, or another loop"
+            )
 
     @cached_property
     def _fixed(self) -> _Fixed:
@@ -472,14 +570,14 @@ class RotorBench:
         )  # fmt: skip
 
     def _unbalance(self, u: Turning) -> Array:
-        """Return what cos and sin of the angle do to the states: U W² (cos, sin)(angle + phase) in the planes x, y."""
+        """Return what cos and sin of the angle do to the states: U (W² - jW') exp(j(angle + phase)) in x + jy."""
         rotor, pushes = self.model, np.zeros((len(self.model.states), 2))
         mass, _, _ = rotor.rotor_matrices(self.plant.parameters)
-        n, size = len(rotor.coordinates), u.value * rotor.speed**2
-        turned = np.array([[math.cos(u.phase), -math.sin(u.phase)], [math.sin(u.phase), math.cos(u.phase)]])
+        pull = u.value * complex(rotor.speed**2, -self.acceleration) * cmath.exp(1j * u.phase)
+        n, turned = len(rotor.coordinates), np.array([[pull.real, -pull.imag], [pull.imag, pull.real]])
         for plane in (p for p in (0, 1) if p in rotor.planes):
             at = [k for k, q in enumerate(rotor.coordinates) if q.endswith("xy"[plane])]
-            pushes[[n + k for k in at]] = size * np.outer(self.shapes[u.name] / mass[at], turned[plane])
+            pushes[[n + k for k in at]] = np.outer(self.shapes[u.name] / mass[at], turned[plane])
         return pushes
 
     def _runout(self, angle: Array) -> Array:

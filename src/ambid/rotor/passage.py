@@ -1,0 +1,221 @@
+"""Run-up and coast-down of a rotor: its synchronous motion over the speed, whirl and orbits, slow roll, waterfall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.errors import EstimationError
+from ambid.physics.rotor_model import RotorModel, position_role
+from ambid.record import Record
+from ambid.rotor.synchronous import Source, angle_of_pulses
+from ambid.signals.orders import Orders, Waterfall, track_orders, waterfall
+
+_ROLLS = 3  # blocks that a slow roll needs
+_RANGE = 0.2  # of the speed over its mean, from which a record is a run-up or a coast-down
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Turning:
+    """How a rotor turned in a record, its speed free to change."""
+
+    angle: Array  # (n_samples,), rad, not wrapped
+    source: Source  # "angle" and "tacho" count from a mark on the rotor, so that phases of several records compare
+
+    def speed(self, rate_hz: float) -> Array:
+        """Return the speed at every sample, rad/s, with its sign."""
+        return np.asarray(np.gradient(self.angle) * rate_hz)
+
+
+def turning_of(record: Record) -> Turning:
+    """Return how the rotor turned: by its angle, pulses once a revolution, or the integral of its speed."""
+    rate = record.rate_hz
+    if "angle" in record:
+        return Turning(angle=np.unwrap(record["angle"].values), source="angle")
+    if "tacho" in record:
+        return Turning(angle=angle_of_pulses(record["tacho"].values, rate), source="tacho")
+    if "speed" in record:
+        w = record["speed"].values
+        angle = np.concatenate([[0.0], np.cumsum(0.5 * (w[1:] + w[:-1]))]) / rate
+        return Turning(angle=angle, source="speed")
+    raise EstimationError(
+        "the record has neither angle, tacho nor speed; orders over the speed need one of them. Log it, and name its "
+        "column in [channels]"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whirl:
+    """The synchronous motion of one plane of sensors, x + jy = forward exp(j angle) + backward exp(-j angle)."""
+
+    forward: Complex  # (n,), m; forward turns as the shaft does
+    backward: Complex
+    sd: Array  # (n,), of real and imaginary part of each
+
+    @property
+    def major(self) -> Array:
+        """Half the major axis of the orbit, (n,), m."""
+        return np.asarray(np.abs(self.forward) + np.abs(self.backward))
+
+    @property
+    def minor(self) -> Array:
+        """Half the minor axis, negative where the whirl is backward."""
+        return np.asarray(np.abs(self.forward) - np.abs(self.backward))
+
+    @property
+    def inclination(self) -> Array:
+        """Angle of the major axis from x to y, rad, between -pi/2 and pi/2."""
+        at = 0.5 * (np.angle(self.forward) + np.angle(self.backward))
+        return np.asarray((at + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Passage:
+    """The positions of a rotor while its speed changes; phases count from angle zero, leads are positive."""
+
+    roles: tuple[str, ...]  # positions, as the model has them
+    model: RotorModel
+    orders: Orders
+    source: Source
+    reverse: bool  # whether the rotor turns from y to x
+    slow_roll: Complex  # (n_roles,), taken out of order 1; zero: nothing is
+
+    @property
+    def speed(self) -> Array:
+        """Of each block in the order of time, rad/s, (n,)."""
+        return self.orders.speed
+
+    @property
+    def rising(self) -> bool:
+        """Whether the rotor runs up, over all."""
+        return bool(self.speed[-1] > self.speed[0])
+
+    @cached_property
+    def amplitude(self) -> Complex:
+        """Synchronous amplitudes without slow roll, (n, n_roles), m: x(t) = Re a exp(j angle)."""
+        return np.asarray(self.orders.of(1)[0] - self.slow_roll)
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviation of real and of imaginary part, (n, n_roles)."""
+        return self.orders.of(1)[1]
+
+    @property
+    def planes(self) -> tuple[tuple[str, int, int], ...]:
+        """Name of each plane of sensors with two axes, such as "A" or "A 2", and the places of x and y in `roles`."""
+        planes: list[tuple[str, int, int]] = []
+        for b in self.model.bearings:
+            for k in range(len(b.z_sensors)):
+                pair = [position_role(axis, k) for axis in b.axes]
+                if len(pair) == 2 and set(pair) <= set(self.roles):
+                    x, y = (self.roles.index(role) for role in pair)
+                    planes.append((b.name if k == 0 else f"{b.name} {k + 1}", x, y))
+        return tuple(planes)
+
+    def whirl(self, plane: str) -> Whirl:
+        """Return the whirl of a plane of `planes` over the speed."""
+        x, y = next((x, y) for name, x, y in self.planes if name == plane)
+        return whirl_of(self.amplitude[:, [x, y]], self.sd[:, [x, y]], reverse=self.reverse)
+
+    def rolled(self, low: float, high: float) -> Passage:
+        """Return the passage with the mean vector between two speeds, rad/s, taken out as slow roll.
+
+        In a magnetic bearing with an integrator the sensors' run-out shows less at low speed than it does above: what
+        is taken out there is a convention, and resonances are fitted without it.
+        """
+        within = (self.speed >= low) & (self.speed <= high)
+        if np.count_nonzero(within) < _ROLLS:
+            rpm = 30.0 / np.pi
+            raise EstimationError(
+                f"between {low * rpm:.4g} and {high * rpm:.4g} rpm there are {np.count_nonzero(within)} blocks of "
+                f"whole turns; a slow roll needs {_ROLLS}. Choose other speeds, or stay longer there"
+            )
+        mean = self.orders.of(1)[0][within].mean(axis=0)
+        return replace(self, slow_roll=mean)
+
+
+def whirl_of(amplitude: Complex, sd: Array, *, reverse: bool = False) -> Whirl:
+    """Return the whirl by the amplitudes of x and y, (n, 2); `reverse`: the rotor turns from y to x."""
+    x, y = amplitude[:, 0], -amplitude[:, 1] if reverse else amplitude[:, 1]
+    return Whirl(
+        forward=0.5 * (x + 1j * y), backward=0.5 * np.conj(x - 1j * y), sd=0.5 * np.sqrt((sd**2).sum(axis=1))
+    )  # fmt: skip
+
+
+def positions_of(record: Record, model: RotorModel) -> tuple[str, ...]:
+    """Return the positions of a model that a record has."""
+    return tuple(r for r in model.outputs if "_position" in r and r in record)
+
+
+def track_passage(record: Record, model: RotorModel, *, turns: int = 8, orders: Sequence[int] = (1, 2, 3)) -> Passage:
+    """Return the synchronous motion of a record, seen through its rig, at a speed that may change as it likes; `turns`:
+    of a block, over which amplitudes are means.
+    """
+    roles, turning = positions_of(record, model), turning_of(record)
+    y = np.column_stack([record[role].values for role in roles])
+    tracked = track_orders(y, turning.angle, record.rate_hz, turns=turns, orders=orders)
+    return Passage(
+        roles=roles, model=model, orders=tracked, source=turning.source,
+        reverse=bool(turning.angle[-1] < turning.angle[0]), slow_roll=np.zeros(len(roles), dtype=np.complex128),
+    )  # fmt: skip
+
+
+def changes_speed(record: Record) -> bool:
+    """Whether a record with an angle or a speed is a run-up or a coast-down."""
+    if not {"angle", "tacho", "speed"} & set(record.names):
+        return False
+    speed = np.abs(turning_of(record).speed(record.rate_hz))
+    parts = np.array([x.mean() for x in np.array_split(speed, 20)])
+    return bool(np.ptp(parts) > _RANGE * parts.mean())
+
+
+def record_waterfall(
+    record: Record, model: RotorModel, *, spectra: int = 120, highest_hz: float | None = None
+) -> Waterfall:
+    """Return the waterfall of the positions of a record, in the order of `positions_of`."""
+    y = np.column_stack([record[role].values for role in positions_of(record, model)])
+    speed = turning_of(record).speed(record.rate_hz)
+    return waterfall(y, speed, record.rate_hz, spectra=spectra, highest_hz=highest_hz)
+
+
+# --- displacement from the centre -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Displacement:
+    """How far a plane of sensors is from the centre of its clearance in a record, as ISO 14839-2 counts it: zero to
+    peak, with the offset at rest.
+    """
+
+    plane: str  # as `Passage.planes`; of a single axis its name
+    largest: float  # of √(x² + y²), m
+    at_s: float
+    offset: tuple[float, ...]  # mean of each axis from the centre, m
+    vibration: float  # largest distance from that mean, m
+
+
+def displacements(record: Record, model: RotorModel, centre: float = 0.0) -> tuple[Displacement, ...]:
+    """Return the largest displacement of every plane; `centre`: reading of the positions at the centre of the
+    clearance, m.
+    """
+    every: list[Displacement] = []
+    for b in model.bearings:
+        for k in range(len(b.z_sensors)):
+            axes = [position_role(axis, k) for axis in b.axes if position_role(axis, k) in record]
+            if not axes:
+                continue
+            y = np.column_stack([record[role].values for role in axes]) - centre
+            size, mean = np.hypot.reduce(y, axis=1), y.mean(axis=0)
+            at = int(np.argmax(size))
+            every.append(
+                Displacement(
+                    plane=b.name if k == 0 else f"{b.name} {k + 1}", largest=float(size[at]),
+                    at_s=at / record.rate_hz, offset=tuple(mean.tolist()),
+                    vibration=float(np.hypot.reduce(y - mean, axis=1).max()),
+                )
+            )  # fmt: skip
+    return tuple(every)

@@ -1,0 +1,181 @@
+"""Order tracking: the amplitudes a_k of x(t) = Re Σ_k a_k exp(j k angle(t)) while the speed changes, by least squares
+over blocks of whole turns; and the waterfall, spectra over the speed.
+
+In a block order 1 may change linearly, so that its amplitude is the mean over the block whatever the acceleration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array, Complex
+from ambid.errors import EstimationError
+
+_CHUNK = 200_000  # samples that are worked on at once
+_PER_COLUMN = 2.0  # samples of a block for each column of its regression, at least
+_CHANGES = 0.25  # of the speed within a block, relative, at most: the first turns from rest are left out
+_LEAST = 8  # blocks
+_AROUND = 10  # blocks on either side that show the noise
+_TOP = 0.45  # of the rate, up to which an order is tracked
+_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)  # what is smooth over five blocks drops out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Orders:
+    """Orders of some channels, block by block in the order of time; a block holds a number of whole turns."""
+
+    first: NDArray[np.int64]  # (n_blocks,), first sample of each block
+    stop: NDArray[np.int64]
+    time_s: Array  # (n_blocks,), of the middle
+    speed: Array  # (n_blocks,), mean of the block, rad/s, positive
+    acceleration: Array  # (n_blocks,), rad/s²
+    orders: tuple[int, ...]
+    amplitude: Complex  # (n_blocks, n_orders, n_channels), mean over the block
+    sd: Array  # (n_blocks, n_orders, n_channels), of real and of imaginary part
+    mean: Array  # (n_blocks, n_channels)
+    rate_hz: float
+
+    @property
+    def bandwidth_hz(self) -> Array:
+        """What a block resolves, one over its length: (n_blocks,)."""
+        return np.asarray(self.rate_hz / (self.stop - self.first))
+
+    def of(self, order: int = 1) -> tuple[Complex, Array]:
+        """Return amplitudes and standard deviations (n_blocks, n_channels) of an order."""
+        k = self.orders.index(order)
+        return self.amplitude[:, k], self.sd[:, k]
+
+
+def track_orders(
+    y: Array, angle: Array, rate_hz: float, *, turns: int = 8, orders: Sequence[int] = (1, 2, 3)
+) -> Orders:
+    """Return the orders of channels (n_samples, n_channels) of a rotor whose angle in rad, (n_samples,), is not
+    wrapped; `turns`: of a block.
+    """
+    first, stop = _blocks(angle, turns, 2 * len(orders) + 4)
+    length = stop - first
+    time, speed = 0.5 * (first + stop - 1) / rate_hz, np.abs(angle[stop - 1] - angle[first]) / (length - 1) * rate_hz
+    used = tuple(k for k in orders if k * speed.max() < 2.0 * np.pi * _TOP * rate_hz)
+    if 1 not in used:
+        raise EstimationError(
+            f"the rotor turns {speed.max() / (2.0 * np.pi):.4g} times a second, too fast for a rate of {rate_hz:g} Hz. "
+            "Record faster"
+        )
+    solved = np.empty((first.size, 4 + 2 * len(used), y.shape[1]))
+    for part in _parts(first, stop):
+        a, b = first[part][0], stop[part][-1]
+        solved[part] = _solved(y[a:b], np.abs(angle[a:b] - angle[0]), first[part] - a, stop[part] - a, used)
+    at = 2 + 2 * np.arange(len(used))
+    amplitude = solved[:, at] + 1j * solved[:, at + 1]
+    return Orders(
+        first=first, stop=stop, time_s=time, speed=speed,
+        acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude, sd=_scatter(amplitude),
+        mean=solved[:, 0], rate_hz=rate_hz,
+    )  # fmt: skip
+
+
+def _blocks(angle: Array, turns: int, columns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the blocks in which the rotor turns on by `turns` at a speed that changes little."""
+    turned = np.abs(angle - angle[0])
+    count = int(turned[-1] / (2.0 * np.pi * turns))
+    if (np.diff(turned) < 0.0).any():
+        turned = np.maximum.accumulate(turned)  # an encoder may jitter
+    edges = np.searchsorted(turned, 2.0 * np.pi * turns * np.arange(count + 1)).astype(np.int64)
+    first, stop = edges[:-1], edges[1:]
+    middle = (first + stop) // 2
+    before, after = turned[middle] - turned[first], turned[np.minimum(stop, turned.size - 1)] - turned[middle]
+    even = np.abs(
+        after / np.maximum(middle - first, 1) / (np.maximum(before, 1e-300) / np.maximum(stop - middle, 1)) - 1
+    )
+    good = (stop - first >= _PER_COLUMN * columns) & (even < _CHANGES)
+    if np.count_nonzero(good) < _LEAST:
+        raise EstimationError(
+            f"the rotor makes {turned[-1] / (2.0 * np.pi):.4g} turns in this record, of which {np.count_nonzero(good)} "
+            f"blocks of {turns} turns can be used; orders need {_LEAST} blocks with more than "
+            f"{_PER_COLUMN * columns:g} samples each. Record for longer, or faster"
+        )
+    return first[good], stop[good]
+
+
+def _parts(first: NDArray[np.int64], stop: NDArray[np.int64]) -> list[slice]:
+    """Return blocks that are worked on together."""
+    parts, begin = list[slice](), 0
+    for k in range(1, first.size + 1):
+        if k == first.size or stop[k] - first[begin] > _CHUNK:
+            parts.append(slice(begin, k))
+            begin = k
+    return parts
+
+
+def _solved(y: Array, angle: Array, first: NDArray[np.int64], stop: NDArray[np.int64], orders: Sequence[int]) -> Array:
+    """Return the coefficients (n_blocks, n_columns, n_channels) of 1, t, cos and -sin of each order, then t cos and -t
+    sin of the first, t from -1 to 1 in a block.
+    """
+    place, length = np.arange(y.shape[0]), stop - first
+    block = np.clip(np.searchsorted(first, place, "right") - 1, 0, first.size - 1)
+    inside = (place >= first[block]) & (place < stop[block])
+    t = np.where(inside, 2.0 * (place - first[block]) / np.maximum(length[block] - 1, 1) - 1.0, 0.0)
+    turn = np.exp(1j * angle) * inside
+    waves, power = [], turn
+    for k in range(1, max(orders) + 1):
+        if k in orders:
+            waves += [power.real, -power.imag]
+        power = power * np.where(inside, turn, 0.0)
+    columns = [inside.astype(np.float64), t, *waves, t * turn.real, -t * turn.imag]
+    p = len(columns)
+    gram, right = np.empty((first.size, p, p)), np.empty((first.size, p, y.shape[1]))
+    for i, x in enumerate(columns):
+        right[:, i] = np.add.reduceat(x[:, None] * y, first, axis=0)
+        for j in range(i + 1):
+            gram[:, i, j] = gram[:, j, i] = np.add.reduceat(x * columns[j], first)
+    return np.asarray(np.linalg.solve(gram, right))
+
+
+def _scatter(amplitude: Complex) -> Array:
+    """Return the standard deviation of real and imaginary part by the fourth difference of five blocks, the median over
+    some blocks around: what changes smoothly, or in a narrow resonance, is no noise.
+    """
+    n = amplitude.shape[0]
+    power = sum(c * amplitude[k : n - 4 + k] for k, c in enumerate(_DIFFERENCE))
+    size = np.abs(np.pad(power, ((2, 2), (0, 0), (0, 0)), mode="edge")) ** 2
+    wide = np.pad(size, ((_AROUND, _AROUND), (0, 0), (0, 0)), mode="reflect" if n > _AROUND else "edge")
+    window = np.lib.stride_tricks.sliding_window_view(wide, 2 * _AROUND + 1, axis=0)
+    return np.asarray(np.sqrt(np.median(window, axis=-1) / (2.0 * np.log(2.0))))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Waterfall:
+    """Amplitude spectra of channels over the speed."""
+
+    speed: Array  # (n_spectra,), rad/s, mean of each spectrum's samples
+    time_s: Array  # (n_spectra,), of the middle
+    frequency_hz: Array  # (n_frequencies,)
+    amplitude: Array  # (n_spectra, n_frequencies, n_channels), of a sine, Hann window
+
+
+def waterfall(
+    y: Array, speed: Array, rate_hz: float, *, spectra: int = 120, highest_hz: float | None = None,
+    resolution_hz: float = 5.0,
+) -> Waterfall:  # fmt: skip
+    """Return `spectra` evenly over the record of channels (n_samples, n_channels), each as long as it resolves
+    `resolution_hz`; `speed` (n_samples,), rad/s.
+    """
+    n = y.shape[0]
+    size = min(n, max(16, round(2.0 * rate_hz / resolution_hz)))  # two bins: the half width of the window
+    starts = np.unique(np.linspace(0, n - size, max(1, spectra)).round().astype(np.int64))
+    window = np.hanning(size + 1)[:-1]
+    frequency = np.fft.rfftfreq(size, 1.0 / rate_hz)
+    top = frequency.size if highest_hz is None else int(np.searchsorted(frequency, highest_hz, "right"))
+    amplitude = np.empty((starts.size, top, y.shape[1]))
+    for k, a in enumerate(starts):
+        part = y[a : a + size]
+        lines = np.fft.rfft((part - part.mean(axis=0)) * window[:, None], axis=0)[:top]
+        amplitude[k] = 2.0 / window.sum() * np.abs(lines)
+    return Waterfall(
+        speed=np.array([np.mean(np.abs(speed[a : a + size])) for a in starts]),
+        time_s=(starts + 0.5 * size) / rate_hz, frequency_hz=frequency[:top], amplitude=amplitude,
+    )  # fmt: skip
