@@ -5,9 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ambid.arrays import Array, Complex
+from ambid.errors import EstimationError
 from ambid.estimation.modes import EstimatedNumber
-from ambid.rotor.passage import Passage
+from ambid.estimation.result import NORMAL_95
+from ambid.rotor.passage import Passage, whirl_of
+from ambid.rotor.passage_fit import Course, ModalFit, fitted, with_another
+
+_STANDS_OUT = 0.01  # of the largest value, by which a peak rises above what is around it
+_MODES = 8  # at most
+_GRID = 600  # speeds
+_DRAWS = 60  # of the response, for intervals
+_NEAR, _WIDTHS = 0.03, 1.5  # of the frequency, and damping ratios, within which a peak belongs to a pole
+_MISFIT = 2.0  # mean square of residuals over their variance from which the fit is doubtful
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,8 +40,30 @@ class Peak:
 
 
 def peaks(speed: Array, size: Array) -> tuple[Peak, ...]:
-    """Return the peaks of a smooth response (n,) over the speed in rad/s, rising or falling, by rising speed."""
-    raise NotImplementedError
+    """Return the peaks of a response (n,) over the speed in rad/s, in any order, by rising speed."""
+    from scipy.signal import find_peaks
+
+    order = np.argsort(speed, kind="stable")
+    x, y = speed[order], size[order]
+    at, _ = find_peaks(y, prominence=_STANDS_OUT * float(y.max(initial=0.0)))
+    return tuple(_peak_at(x, y, int(k)) for k in at)
+
+
+def _peak_at(x: Array, y: Array, k: int) -> Peak:
+    """Return the peak around a largest value: the top of a parabola, and where it falls to 1/√2 of that."""
+    a, b, c = np.polyfit(x[k - 1 : k + 2] - x[k], y[k - 1 : k + 2], 2)
+    shift = -b / (2.0 * a) if a < 0.0 else 0.0
+    shift = shift if x[k - 1] - x[k] <= shift <= x[k + 1] - x[k] else 0.0
+    top = float(c + b * shift + a * shift**2)
+    ends = []
+    for step in (-1, 1):
+        m = k
+        while 0 <= m + step < x.size and y[m] > top / np.sqrt(2.0) and y[m] <= top * (1.0 + _STANDS_OUT):
+            m += step
+        fell = y[m] <= top / np.sqrt(2.0)
+        pair = sorted((m, m - step), key=lambda i: y[i])
+        ends.append(float(np.interp(top / np.sqrt(2.0), y[pair], x[pair])) if fell else None)
+    return Peak(speed=float(x[k] + shift), size=top, lower=ends[0], upper=ends[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +103,108 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     """Return the resonances of passages of one machine, up or down; `least`: AF below which a mode is critically
     damped; `modes`: how many are fitted, by default as many as the data ask for.
     """
-    raise NotImplementedError
+    courses = [Course.of(p) for p in passages]
+    fit = fitted(courses, np.zeros(0, dtype=np.complex128))
+    while fit.poles.size < (_MODES if modes is None else modes):
+        more = with_another(fit)
+        numbers = 2 + 4 * sum(c.amplitude.shape[1] for c in courses)
+        if modes is None and fit.cost - more.cost < numbers * np.log(fit.J.shape[0]) * max(more.misfit, 1.0):
+            break
+        fit = more
+    first = int(np.argmax([c.speed.size for c in courses]))
+    low, high = min(c.speed.min() for c in courses), max(c.speed.max() for c in courses)
+    speed = _grid(fit.poles, float(low), float(high))
+    response = fit.response(speed, first)
+    draws = fit.drawn(np.random.default_rng(0), speed, _DRAWS, first)
+    passage, modal = passages[first], []
+    for r in np.argsort(np.abs(fit.poles)):
+        if low <= np.abs(fit.poles[r]) <= high:
+            one = _resonance(fit, int(r), passage, first, speed, response, draws, least)
+            if not one.critically_damped or one.damping.identifiable:
+                modal.append(one)
+    return Resonances(
+        resonances=tuple(modal), speed=speed, response=response, roles=passage.roles, misfit=fit.misfit,
+        warnings=tuple(_warnings(fit, passages)),
+    )  # fmt: skip
+
+
+def _grid(poles: Complex, low: float, high: float) -> Array:
+    """Return speeds over the range, closer around the poles."""
+    near = [abs(s) + side * width * abs(s.real) for s in poles for side in (-1, 1) for width in np.linspace(0, 6, 61)]
+    every = np.concatenate([np.linspace(low, high, _GRID), [x for x in near if low < x < high]])
+    return np.asarray(np.unique(every))
+
+
+def _majors(passage: Passage, response: Complex) -> dict[str, Array]:
+    """Return the orbit's half major axis of each plane by its response, of a single axis its amplitude."""
+    none = np.zeros((response.shape[0], 2))
+    of_planes = {
+        name: whirl_of(response[:, [x, y]], none, reverse=passage.reverse).major for name, x, y in passage.planes
+    }
+    paired = {k for _, x, y in passage.planes for k in (x, y)}
+    return of_planes | {role: np.abs(response[:, k]) for k, role in enumerate(passage.roles) if k not in paired}
+
+
+def _resonance(
+    fit: ModalFit, r: int, passage: Passage, course: int, speed: Array, response: Complex, draws: list[Complex],
+    least: float,
+) -> Resonance:  # fmt: skip
+    """Return what is known of one pole."""
+    s, residues = complex(fit.poles[r]), fit.weights[course][r]
+    own = fit.covariance[2 * r : 2 * r + 2, 2 * r : 2 * r + 2]
+    size = abs(s)
+    along = np.array([s.real, s.imag]) / size  # |s| by real and imaginary part
+    across = np.array([-1.0 / size + s.real**2 / size**3, s.real * s.imag / size**3])  # -Re s/|s|
+    frequency = EstimatedNumber.of(size, float(np.sqrt(along @ own @ along)))
+    damping = EstimatedNumber.of(-s.real / size, float(np.sqrt(across @ own @ across)))
+    part = _majors(passage, residues[None, :])
+    plane = max(part, key=lambda name: float(part[name][0]))
+    wide = max(_NEAR, _WIDTHS * damping.value) * size
+
+    def near(curve: Array, x: Array) -> Peak | None:
+        close = [p for p in peaks(x, curve) if abs(p.speed - size) < wide]
+        return min(close, key=lambda p: abs(p.speed - size), default=None)
+
+    peak = near(_majors(passage, response)[plane], speed)
+    others = [near(_majors(passage, y)[plane], speed) for y in draws]
+    at, factor, by_points = frequency, _inverse(damping), False
+    if peak is not None:
+        at = EstimatedNumber.of(peak.speed, float(np.std([p.speed for p in others if p is not None])))
+        factors = [p.amplification for p in others if p is not None and p.amplification is not None]
+        if peak.amplification is not None and len(factors) > 0.9 * len(draws):
+            factor, by_points = EstimatedNumber.of(peak.amplification, float(np.std(factors))), True
+    x, y = (np.array([residues[p[k]] for p in passage.planes]) for k in (1, 2))
+    y = -y if passage.reverse else y
+    forward, backward = float(np.sum(np.abs(x + 1j * y) ** 2)), float(np.sum(np.abs(x - 1j * y) ** 2))
+    largest = residues[int(np.argmax(np.abs(residues)))]
+    return Resonance(
+        speed=at, amplification=factor, half_power=by_points, critically_damped=factor.value < least,
+        frequency=frequency, damping=damping, pole=s,
+        shape={role: complex(v / largest) for role, v in zip(passage.roles, residues, strict=True)},
+        forward=forward / (forward + backward) if passage.planes else None,
+        measured=near(_majors(passage, passage.amplitude)[plane], passage.speed), plane=plane,
+    )  # fmt: skip
+
+
+def _inverse(damping: EstimatedNumber) -> EstimatedNumber:
+    """Return the amplification factor of a damping ratio."""
+    return EstimatedNumber.of(0.5 / damping.value, 0.5 * damping.sd / damping.value**2)
+
+
+def _warnings(fit: ModalFit, passages: Sequence[Passage]) -> list[str]:
+    """Return what is doubtful of a fit."""
+    warnings = []
+    if fit.misfit > _MISFIT:
+        warnings.append(
+            f"{fit.poles.size} modes leave {fit.misfit:.3g} times the noise of the synchronous response; the intervals "
+            "are widened by that. Look at the run-up for what changes on the way"
+        )
+    if any(p.source == "speed" for p in passages):
+        warnings.append(
+            "the angle is the integral of the logged speed, whose error turns the phases; log the angle or pulses once "
+            "a revolution"
+        )
+    return warnings
 
 
 # --- margins ----------------------------------------------------------------------------------------------------------
@@ -114,7 +249,22 @@ def separations(
     resonances: Sequence[Resonance], operating: tuple[float, float], rule: SeparationRule | None = None
 ) -> tuple[Separation, ...]:
     """Return the margin of each resonance to the lowest and highest operating speed, rad/s."""
-    raise NotImplementedError
+    rule, margins = rule or SeparationRule(), []
+    low, high = operating
+    for one in resonances:
+        at, above = one.speed, one.speed.value > high
+        near = high if above else low
+        actual = 0.0 if low <= at.value <= high else abs(at.value - near) / near
+        factor = one.amplification
+        required, most = (rule.required(x, above=above) for x in (factor.value, factor.ci95[1]))
+        sd = at.sd / near
+        margins.append(
+            Separation(
+                resonance=one, actual=actual, required=required, required_most=most, sd=sd,
+                passed=one.critically_damped or actual - NORMAL_95 * sd >= most,
+            )
+        )  # fmt: skip
+    return tuple(margins)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +286,19 @@ def scaled_to_limit(
     """Scale a response (n,), zero to peak in m, so that its largest in the operating range is `limit`, by a factor
     within `factors`, and compare its largest at any speed with `room`.
     """
-    raise NotImplementedError
+    inside = (speed >= operating[0]) & (speed <= operating[1])
+    if not inside.any():
+        rpm = 30.0 / np.pi
+        raise EstimationError(
+            f"the passage has no speed between {operating[0] * rpm:.5g} and {operating[1] * rpm:.5g} rpm; the response "
+            "is scaled there. Run up to the operating speed"
+        )
+    k, top = int(np.argmax(np.where(inside, size, -np.inf))), int(np.argmax(size))
+    factor = float(np.clip(limit / size[k], *factors))
+    return Scaled(
+        factor=factor, at=float(speed[k]), largest=factor * float(size[top]), largest_at=float(speed[top]), room=room,
+        passed=factor * float(size[top]) <= room,
+    )  # fmt: skip
 
 
 # --- whirl at constant speed ------------------------------------------------------------------------------------------

@@ -1,0 +1,264 @@
+"""Modal fit of synchronous responses while the speed W changes: poles s_r common to all, by variable projection.
+
+A force exp(j angle) on a pole gives b exp(j angle), b' = (s - jW) b + 1; at an acceleration W' that is steady over the
+pole's memory, with D = jW - s,
+
+b = ∫₀^∞ exp(-D u + j W' u²/2) du = √π/(2q) w(jD/(2q)),   q² = -j W'/2,   w the Faddeeva function,
+
+1/D at constant speed. Unbalance is minus the second derivative of exp(j angle): its response is that of the pole beside
+1 and jW, exactly. So the response of a loop to unbalance and run-out together is a sum of the b of all poles, free and
+conjugate, and derivatives of exp(j angle) for what lies outside the range. Every column is averaged over a block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.rotor.passage import Passage
+
+_SERIES = 2e-3  # |W'|/|D|² up to which a series replaces the Faddeeva function
+_GAUSS = ((-0.7745966692414834, 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.7745966692414834, 5.0 / 18.0))
+_BEYOND = 4  # derivatives of exp(j angle), from none on
+_DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)  # ratios that are tried
+_TRIED = 80  # frequencies that are tried
+_REACH = 1.3  # of the highest speed, up to which poles are sought
+_STEPS = 40
+_STILL = 1e-9  # relative change of the sum of squares
+_RANK = 1e-10  # of the largest singular value of the columns
+
+
+def answers(s: complex, speed: Array, acceleration: Array) -> tuple[Complex, Complex]:
+    """Return b and its derivative by s, (n,)."""
+    D = 1j * speed - s
+    small = np.abs(acceleration) <= _SERIES * np.abs(D) ** 2
+    b, slope = 1.0 / D, 1.0 / D**2
+    x = 1j * acceleration / D**2  # ∫ uᵐ exp(-Du) (1 + jW'u²/2 + …) du
+    series = 1.0 + x * (1.0 + 3.0 * x * (1.0 + 5.0 * x * (1.0 + 7.0 * x)))
+    steeper = 1.0 + 3.0 * x * (1.0 + 5.0 * x * (1.0 + 7.0 * x * (1.0 + 9.0 * x)))
+    b, slope = b * series, slope * steeper
+    if not small.all():
+        from scipy.special import wofz
+
+        fast = ~small
+        q = np.sqrt(-0.5j * acceleration[fast])
+        b[fast] = 0.5 * np.sqrt(np.pi) / q * wofz(0.5j * D[fast] / q)
+        slope[fast] = (D[fast] * b[fast] - 1.0) / (1j * acceleration[fast])
+    return b, slope
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Course:
+    """What is fitted of one passage."""
+
+    speed: Array  # (n,), rad/s
+    acceleration: Array
+    half: Array  # half the length of each block, s
+    amplitude: Complex  # (n, n_roles)
+    sd: Array  # (n, n_roles), of real and imaginary part
+
+    @classmethod
+    def of(cls, passage: Passage) -> Course:
+        """Return what is fitted: the synchronous amplitudes with what slow roll is in them."""
+        orders = passage.orders
+        amplitude, sd = orders.of(1)
+        floor = 1e-6 * np.abs(amplitude).max(axis=0)
+        half = 0.5 * (orders.stop - orders.first) / orders.rate_hz
+        return cls(
+            speed=orders.speed, acceleration=orders.acceleration, half=half, amplitude=amplitude,
+            sd=np.maximum(sd, floor),
+        )  # fmt: skip
+
+    @cached_property
+    def _points(self) -> list[tuple[float, Array]]:
+        return [(weight, self.speed + at * self.half * self.acceleration) for at, weight in _GAUSS]
+
+    def pole(self, s: complex) -> tuple[Complex, Complex]:
+        """Return what a pole answers and its derivative, averaged over the blocks, (n,)."""
+        parts = [(weight, answers(s, w, self.acceleration)) for weight, w in self._points]
+        return sum(c * b for c, (b, _) in parts), sum(c * d for c, (_, d) in parts)
+
+    def beyond(self, top: float) -> Complex:
+        """Return derivatives of exp(j angle) over that, from none on, averaged, (n, _BEYOND)."""
+        return sum(c * derivatives(w / top, self.acceleration / top**2) for c, w in self._points)
+
+
+def derivatives(speed: Array, acceleration: Array | float = 0.0) -> Complex:
+    """Return the derivatives of exp(j angle) over that, from none on, (n, _BEYOND)."""
+    first = 1j * speed
+    return np.column_stack(
+        [np.ones(speed.size), first, first**2 + 1j * acceleration, first**3 - 3.0 * speed * acceleration]
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModalFit:
+    """Poles, and of every passage and role what the columns weigh."""
+
+    poles: Complex  # (n_poles,), positive imaginary part, by frequency
+    courses: tuple[Course, ...]
+    top: float  # rad/s, by which derivatives are scaled
+    weights: tuple[Complex, ...]  # of each passage (n_columns, n_roles): poles, conjugate poles, derivatives
+    cost: float  # sum of squares of the residuals over their standard deviations
+    J: Array  # (n_residuals, 2 n_poles) of those by real and imaginary parts of the poles
+
+    @property
+    def freedom(self) -> int:
+        """Real residuals less numbers that are fitted."""
+        columns = 2 * self.poles.size + _BEYOND
+        return (
+            sum(2 * (c.amplitude.shape[0] - columns) * c.amplitude.shape[1] for c in self.courses) - 2 * self.poles.size
+        )
+
+    @property
+    def misfit(self) -> float:
+        """Mean square of the residuals over their variance."""
+        return self.cost / max(self.freedom, 1)
+
+    @property
+    def covariance(self) -> Array:
+        """Of real and imaginary parts of the poles, (2 n_poles, 2 n_poles), with a misfit above 1 counted in."""
+        if not self.poles.size:
+            return np.zeros((0, 0))
+        size = np.linalg.norm(self.J, axis=0)
+        inverse = np.linalg.pinv((self.J / size).T @ (self.J / size), rcond=1e-12, hermitian=True)
+        return np.asarray(inverse / np.outer(size, size) * max(self.misfit, 1.0))
+
+    def columns(self, poles: Complex, speed: Array) -> Complex:
+        """Return the columns of the response at constant speeds, (n, n_columns)."""
+        jw = 1j * speed[:, None]
+        return np.hstack([1.0 / (jw - poles), 1.0 / (jw - np.conj(poles)), derivatives(speed / self.top)])
+
+    def response(self, speed: Array, course: int = 0) -> Complex:
+        """Return the response at constant speeds, (n, n_roles)."""
+        return np.asarray(self.columns(self.poles, speed) @ self.weights[course])
+
+    def drawn(self, rng: np.random.Generator, speed: Array, n: int, course: int = 0) -> list[Complex]:
+        """Return `n` responses at constant speeds as they may be by the uncertainty of poles and weights."""
+        c, size = self.courses[course], np.sqrt(max(self.misfit, 1.0))
+        values, vectors = np.linalg.eigh(self.covariance)
+        steps = rng.standard_normal((n, values.size)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        basis, up, down = _basis(c, self.poles, self.top)
+        parts = []
+        for k in range(c.amplitude.shape[1]):
+            inverse = np.linalg.pinv(basis / c.sd[:, k, None], rcond=_RANK)
+            own = self.weights[course][:, k]
+            slopes = inverse @ (_slopes(own, up, down) / c.sd[:, k, None])
+            root = np.linalg.cholesky(inverse @ inverse.conj().T + 1e-12 * np.diag(np.abs(own) ** 2 + 1e-300))
+            noise = root @ (rng.standard_normal((own.size, n)) + 1j * rng.standard_normal((own.size, n)))
+            parts.append(own[:, None] - slopes @ steps.T + size * noise)
+        at = [self.columns(self.poles + step[0::2] + 1j * step[1::2], speed) for step in steps]
+        return [np.column_stack([x @ part[:, i] for part in parts]) for i, x in enumerate(at)]
+
+
+def _slopes(own: Complex, up: Sequence[Complex], down: Sequence[Complex]) -> Complex:
+    """Return the derivatives of a response by real and imaginary part of each pole, (n, 2 n_poles)."""
+    n, slopes = len(up), []
+    for r in range(n):
+        one, other = own[r] * up[r], own[n + r] * down[r]
+        slopes += [one + other, 1j * (one - other)]
+    return np.column_stack(slopes) if slopes else np.zeros((0, 0), dtype=np.complex128)
+
+
+def _basis(c: Course, poles: Complex, top: float) -> tuple[Complex, list[Complex], list[Complex]]:
+    """Return all columns (n, n_columns), and the slopes of those of poles and conjugate poles."""
+    both = [[c.pole(complex(x)) for x in group] for group in (poles, np.conj(poles))]
+    columns = [b for group in both for b, _ in group]
+    basis = np.column_stack([*columns, c.beyond(top)])
+    return basis, [d for _, d in both[0]], [d for _, d in both[1]]
+
+
+def _solve(basis: Complex, target: Complex) -> tuple[Complex, Complex]:
+    """Return weights by least squares, and an orthonormal basis."""
+    size = np.linalg.norm(basis, axis=0)
+    Q, R = np.linalg.qr(basis / size)
+    U, values, Vh = np.linalg.svd(R)
+    keep = values > _RANK * values[0]
+    weights = (Vh[keep].conj().T / values[keep]) @ (U[:, keep].conj().T @ (Q.conj().T @ target))
+    return (weights.T / size).T, Q
+
+
+def fitted(courses: Sequence[Course], poles: Complex, *, steps: int = _STEPS) -> ModalFit:
+    """Return the fit of some poles, from where they are given, by Gauss-Newton with damping (Kaufman 1975)."""
+    top = max(float(c.speed.max()) for c in courses)
+    present, damping = _projected(courses, poles, top), 1e-3
+    for _ in range(steps if poles.size else 0):
+        fit, left = present
+        H, g = fit.J.T @ fit.J, fit.J.T @ left
+        better = False
+        while damping < 1e8:
+            step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
+            moved = _inside(fit.poles + step[0::2] + 1j * step[1::2], fit.poles, top)
+            trial = _projected(courses, moved, top)
+            if trial[0].cost < fit.cost:
+                better, damping = True, max(0.2 * damping, 1e-9)
+                break
+            damping *= 5.0
+        if not better:
+            break
+        gain, present = 1.0 - trial[0].cost / fit.cost, trial
+        if gain < _STILL:
+            break
+    fit = present[0]
+    return fit
+
+
+def _inside(poles: Complex, before: Complex, top: float) -> Complex:
+    """Return poles that stay stable and oscillate, at most half the way to where they would not."""
+    real = np.where(poles.real < 0.5 * before.real, poles.real, 0.5 * before.real)
+    imag = np.where(poles.imag > 0.5 * before.imag, poles.imag, 0.5 * before.imag)
+    real = np.maximum(real, -2.0 * np.maximum(imag, 0.02 * top))
+    return np.asarray(real + 1j * np.minimum(imag, 2.0 * top))
+
+
+def _projected(courses: Sequence[Course], poles: Complex, top: float) -> tuple[ModalFit, Array]:
+    """Return the fit with all that is linear solved, and its residuals as real numbers."""
+    weights, left, J = [], [], []
+    for c in courses:
+        basis, up, down = _basis(c, poles, top)
+        own = np.empty((basis.shape[1], c.amplitude.shape[1]), dtype=np.complex128)
+        for k in range(c.amplitude.shape[1]):
+            scaled, target = basis / c.sd[:, k, None], c.amplitude[:, k] / c.sd[:, k]
+            own[:, k], Q = _solve(scaled, target)
+            left.append(target - scaled @ own[:, k])
+            if poles.size:
+                s = _slopes(own[:, k], up, down) / c.sd[:, k, None]
+                J.append(-(s - Q @ (Q.conj().T @ s)))
+        weights.append(own)
+    residual = np.concatenate(left)
+    slope = np.vstack(J) if J else np.zeros((residual.size, 0), dtype=np.complex128)
+    fit = ModalFit(
+        poles=poles, courses=tuple(courses), top=top, weights=tuple(weights),
+        cost=float(np.sum(np.abs(residual) ** 2)), J=np.vstack([slope.real, slope.imag]),
+    )  # fmt: skip
+    return fit, np.concatenate([residual.real, residual.imag])
+
+
+def with_another(fit: ModalFit) -> ModalFit:
+    """Return the fit with one more pole, from where on a grid it explains most."""
+    top, best = fit.top, (0.0, 0j)
+    low = min(float(c.speed.min()) for c in fit.courses)
+    prepared = []
+    for c, own in zip(fit.courses, fit.weights, strict=True):
+        basis = _basis(c, fit.poles, top)[0]
+        for k in range(c.amplitude.shape[1]):
+            scaled = basis / c.sd[:, k, None]
+            Q = np.linalg.qr(scaled / np.linalg.norm(scaled, axis=0))[0]
+            prepared.append((c, k, Q, c.amplitude[:, k] / c.sd[:, k] - scaled @ own[:, k]))
+    for omega in np.linspace(low, _REACH * top, _TRIED):
+        for zeta in _DAMPINGS:
+            s = complex(-zeta * omega, omega * np.sqrt(1.0 - zeta**2))
+            pair = {id(c): np.column_stack([c.pole(s)[0], c.pole(s.conjugate())[0]]) for c in fit.courses}
+            gain = 0.0
+            for c, k, Q, left in prepared:
+                new = pair[id(c)] / c.sd[:, k, None]
+                new = new - Q @ (Q.conj().T @ new)
+                q = np.linalg.qr(new / np.linalg.norm(new, axis=0))[0]
+                gain += float(np.sum(np.abs(q.conj().T @ left) ** 2))
+            if gain > best[0]:
+                best = gain, s
+    return fitted(fit.courses, np.append(fit.poles, best[1]))
