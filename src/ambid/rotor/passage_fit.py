@@ -239,24 +239,25 @@ def _projected(courses: Sequence[Course], poles: Complex, top: float) -> tuple[M
 
 
 def with_another(fit: ModalFit) -> ModalFit:
-    """Return the fit with one more pole, from where on a grid it explains most."""
-    top, best = fit.top, (0.0, 0j)
-    low = min(float(c.speed.min()) for c in fit.courses)
-    prepared = []
+    """Return the fit with one more pole, from where on a grid it explains most, roughly: in the middle of the blocks,
+    the roles weighted alike.
+    """
+    best, prepared = (0.0, 0j), []
     for c, own in zip(fit.courses, fit.weights, strict=True):
-        basis = _basis(c, fit.poles, top)[0]
-        for k in range(c.amplitude.shape[1]):
-            scaled = basis / c.sd[:, k, None]
-            Q = np.linalg.qr(scaled / np.linalg.norm(scaled, axis=0))[0]
-            prepared.append((c, k, Q, c.amplitude[:, k] / c.sd[:, k] - scaled @ own[:, k]))
-    for omega in np.linspace(low, _REACH * top, _TRIED):
+        basis = _basis(c, fit.poles, fit.top)[0]
+        level = np.median(c.sd, axis=0)
+        weight = (level / c.sd).mean(axis=1)[:, None]
+        scaled = basis * weight
+        Q = np.linalg.qr(scaled / np.linalg.norm(scaled, axis=0))[0]
+        prepared.append((c, weight, Q, (c.amplitude - basis @ own) * weight / level))
+    low = min(float(c.speed.min()) for c in fit.courses)
+    for omega in np.linspace(low, _REACH * fit.top, _TRIED):
         for zeta in _DAMPINGS:
-            s = complex(-zeta * omega, omega * np.sqrt(1.0 - zeta**2))
-            pair = {id(c): np.column_stack([c.pole(s)[0], c.pole(s.conjugate())[0]]) for c in fit.courses}
-            gain = 0.0
-            for c, k, Q, left in prepared:
-                new = pair[id(c)] / c.sd[:, k, None]
-                new = new - Q @ (Q.conj().T @ new)
+            s, gain = complex(-zeta * omega, omega * np.sqrt(1.0 - zeta**2)), 0.0
+            for c, weight, Q, left in prepared:
+                pair = (answers(x, c.speed, c.acceleration)[0] for x in (s, s.conjugate()))
+                new = np.column_stack(list(pair)) * weight
+                new -= Q @ (Q.conj().T @ new)
                 q = np.linalg.qr(new / np.linalg.norm(new, axis=0))[0]
                 gain += float(np.sum(np.abs(q.conj().T @ left) ** 2))
             if gain > best[0]:

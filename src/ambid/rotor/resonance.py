@@ -41,12 +41,20 @@ class Peak:
 
 def peaks(speed: Array, size: Array) -> tuple[Peak, ...]:
     """Return the peaks of a response (n,) over the speed in rad/s, in any order, by rising speed."""
-    from scipy.signal import find_peaks
-
     order = np.argsort(speed, kind="stable")
     x, y = speed[order], size[order]
-    at, _ = find_peaks(y, prominence=_STANDS_OUT * float(y.max(initial=0.0)))
-    return tuple(_peak_at(x, y, int(k)) for k in at)
+    tops = np.flatnonzero((y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:])) + 1
+    least = _STANDS_OUT * float(y.max(initial=0.0))
+    return tuple(_peak_at(x, y, int(k)) for k in tops if _prominence(y, int(k)) >= least)
+
+
+def _prominence(y: Array, k: int) -> float:
+    """Return how far a curve falls on either side of a top before it rises above it."""
+    higher = np.flatnonzero(y > y[k])
+    a, b = int(np.searchsorted(higher, k)) - 1, int(np.searchsorted(higher, k))
+    left = y[(higher[a] if a >= 0 else 0) : k + 1].min()
+    right = y[k : (higher[b] if b < higher.size else y.size)].min()
+    return float(y[k] - max(left, right))
 
 
 def _peak_at(x: Array, y: Array, k: int) -> Peak:
