@@ -141,9 +141,8 @@ class Passage:
 def whirl_of(amplitude: Complex, sd: Array, *, reverse: bool = False) -> Whirl:
     """Return the whirl by the amplitudes of x and y, (n, 2); `reverse`: the rotor turns from y to x."""
     x, y = amplitude[:, 0], -amplitude[:, 1] if reverse else amplitude[:, 1]
-    return Whirl(
-        forward=0.5 * (x + 1j * y), backward=0.5 * np.conj(x - 1j * y), sd=0.5 * np.sqrt((sd**2).sum(axis=1))
-    )  # fmt: skip
+    backward = np.conj(0.5 * (x - 1j * y)).astype(np.complex128)
+    return Whirl(forward=0.5 * (x + 1j * y), backward=backward, sd=0.5 * np.sqrt((sd**2).sum(axis=1)))
 
 
 def positions_of(record: Record, model: RotorModel) -> tuple[str, ...]:

@@ -5,9 +5,12 @@ pole's memory, with D = jW - s,
 
 b = ∫₀^∞ exp(-D u + j W' u²/2) du = √π/(2q) w(jD/(2q)),   q² = -j W'/2,   w the Faddeeva function,
 
-1/D at constant speed. Unbalance is minus the second derivative of exp(j angle): its response is that of the pole beside
-1 and jW, exactly. So the response of a loop to unbalance and run-out together is a sum of the b of all poles, free and
-conjugate, and derivatives of exp(j angle) for what lies outside the range. Every column is averaged over a block.
+1/D at constant speed. Gyroscopic terms move the pole with the speed: with c = 1 - d Im s/dW the response is that of a
+fixed pole, the distances to it over c, at the acceleration W'/c; c is known a priori as 1 ± 0.15.
+
+Unbalance is minus the second derivative of exp(j angle): its response is that of the pole beside 1 and jW, exactly. So
+the response of a loop to unbalance and run-out together is a sum of the b of all poles, free and conjugate, and of
+derivatives of exp(j angle) for what lies outside the range. Every column is averaged over a block.
 """
 
 from __future__ import annotations
@@ -29,18 +32,20 @@ _TRIED = 80  # frequencies that are tried
 _REACH = 1.3  # of the highest speed, up to which poles are sought
 _STEPS = 40
 _STILL = 1e-9  # relative change of the sum of squares
+_MOVES = 0.15  # prior standard deviation of c
 _RANK = 1e-10  # of the largest singular value of the columns
 
 
-def answers(s: complex, speed: Array, acceleration: Array) -> tuple[Complex, Complex]:
-    """Return b and its derivative by s, (n,)."""
+def answers(s: complex, speed: Array, acceleration: Array) -> tuple[Complex, Complex, Complex]:
+    """Return b, its derivative by s, and that by the logarithm of the acceleration, (n,)."""
     D = 1j * speed - s
     small = np.abs(acceleration) <= _SERIES * np.abs(D) ** 2
-    b, slope = 1.0 / D, 1.0 / D**2
+    b, slope, bend = 1.0 / D, 1.0 / D**2, 2.0 / D**3
     x = 1j * acceleration / D**2  # ∫ uᵐ exp(-Du) (1 + jW'u²/2 + …) du
     series = 1.0 + x * (1.0 + 3.0 * x * (1.0 + 5.0 * x * (1.0 + 7.0 * x)))
     steeper = 1.0 + 3.0 * x * (1.0 + 5.0 * x * (1.0 + 7.0 * x * (1.0 + 9.0 * x)))
-    b, slope = b * series, slope * steeper
+    bent = 1.0 + 6.0 * x * (1.0 + 7.5 * x * (1.0 + 28.0 / 3.0 * x))
+    b, slope, bend = b * series, slope * steeper, bend * bent
     if not small.all():
         from scipy.special import wofz
 
@@ -48,7 +53,8 @@ def answers(s: complex, speed: Array, acceleration: Array) -> tuple[Complex, Com
         q = np.sqrt(-0.5j * acceleration[fast])
         b[fast] = 0.5 * np.sqrt(np.pi) / q * wofz(0.5j * D[fast] / q)
         slope[fast] = (D[fast] * b[fast] - 1.0) / (1j * acceleration[fast])
-    return b, slope
+        bend[fast] = (D[fast] * slope[fast] - b[fast]) / (1j * acceleration[fast])
+    return b.astype(np.complex128), slope.astype(np.complex128), 0.5j * acceleration * bend
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +73,7 @@ class Course:
         orders = passage.orders
         amplitude, sd = orders.of(1)
         floor = 1e-6 * np.abs(amplitude).max(axis=0)
-        half = 0.5 * (orders.stop - orders.first) / orders.rate_hz
+        half = 0.5 * (orders.stop - orders.first).astype(np.float64) / orders.rate_hz
         return cls(
             speed=orders.speed, acceleration=orders.acceleration, half=half, amplitude=amplitude,
             sd=np.maximum(sd, floor),
@@ -77,14 +83,14 @@ class Course:
     def _points(self) -> list[tuple[float, Array]]:
         return [(weight, self.speed + at * self.half * self.acceleration) for at, weight in _GAUSS]
 
-    def pole(self, s: complex) -> tuple[Complex, Complex]:
-        """Return what a pole answers and its derivative, averaged over the blocks, (n,)."""
-        parts = [(weight, answers(s, w, self.acceleration)) for weight, w in self._points]
-        return sum(c * b for c, (b, _) in parts), sum(c * d for c, (_, d) in parts)
+    def pole(self, s: complex, moving: float) -> Complex:
+        """Return what a pole answers, and its derivatives by s and c, averaged over the blocks, (3, n)."""
+        parts = [weight * np.array(answers(s, w, self.acceleration / moving)) for weight, w in self._points]
+        return np.asarray(sum(parts) / np.array([1.0, 1.0, -moving])[:, None])
 
     def beyond(self, top: float) -> Complex:
         """Return derivatives of exp(j angle) over that, from none on, averaged, (n, _BEYOND)."""
-        return sum(c * derivatives(w / top, self.acceleration / top**2) for c, w in self._points)
+        return np.asarray(sum(c * derivatives(w / top, self.acceleration / top**2) for c, w in self._points))
 
 
 def derivatives(speed: Array, acceleration: Array | float = 0.0) -> Complex:
@@ -99,20 +105,24 @@ def derivatives(speed: Array, acceleration: Array | float = 0.0) -> Complex:
 class ModalFit:
     """Poles, and of every passage and role what the columns weigh."""
 
-    poles: Complex  # (n_poles,), positive imaginary part, by frequency
+    poles: Complex  # (n_poles,), positive imaginary part, as the speed passes them
+    moving: Array  # (n_poles,), c of each
     courses: tuple[Course, ...]
     top: float  # rad/s, by which derivatives are scaled
     weights: tuple[Complex, ...]  # of each passage (n_columns, n_roles): poles, conjugate poles, derivatives
     cost: float  # sum of squares of the residuals over their standard deviations
-    J: Array  # (n_residuals, 2 n_poles) of those by real and imaginary parts of the poles
+    J: Array  # (n_residuals, 3 n_poles), of those by real and imaginary part and c of each pole
+
+    @property
+    def size(self) -> int:
+        """Number of real residuals."""
+        return sum(2 * c.amplitude.size for c in self.courses)
 
     @property
     def freedom(self) -> int:
         """Real residuals less numbers that are fitted."""
         columns = 2 * self.poles.size + _BEYOND
-        return (
-            sum(2 * (c.amplitude.shape[0] - columns) * c.amplitude.shape[1] for c in self.courses) - 2 * self.poles.size
-        )
+        return self.size - 2 * self.poles.size - sum(2 * columns * c.amplitude.shape[1] for c in self.courses)
 
     @property
     def misfit(self) -> float:
@@ -121,7 +131,7 @@ class ModalFit:
 
     @property
     def covariance(self) -> Array:
-        """Of real and imaginary parts of the poles, (2 n_poles, 2 n_poles), with a misfit above 1 counted in."""
+        """Of real and imaginary part and c of each pole, (3 n_poles, 3 n_poles), with a misfit above 1 counted in."""
         if not self.poles.size:
             return np.zeros((0, 0))
         size = np.linalg.norm(self.J, axis=0)
@@ -142,7 +152,7 @@ class ModalFit:
         c, size = self.courses[course], np.sqrt(max(self.misfit, 1.0))
         values, vectors = np.linalg.eigh(self.covariance)
         steps = rng.standard_normal((n, values.size)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
-        basis, up, down = _basis(c, self.poles, self.top)
+        basis, up, down = _basis(c, self.poles, self.moving, self.top)
         parts = []
         for k in range(c.amplitude.shape[1]):
             inverse = np.linalg.pinv(basis / c.sd[:, k, None], rcond=_RANK)
@@ -151,25 +161,23 @@ class ModalFit:
             root = np.linalg.cholesky(inverse @ inverse.conj().T + 1e-12 * np.diag(np.abs(own) ** 2 + 1e-300))
             noise = root @ (rng.standard_normal((own.size, n)) + 1j * rng.standard_normal((own.size, n)))
             parts.append(own[:, None] - slopes @ steps.T + size * noise)
-        at = [self.columns(self.poles + step[0::2] + 1j * step[1::2], speed) for step in steps]
+        at = [self.columns(self.poles + step[0::3] + 1j * step[1::3], speed) for step in steps]
         return [np.column_stack([x @ part[:, i] for part in parts]) for i, x in enumerate(at)]
 
 
 def _slopes(own: Complex, up: Sequence[Complex], down: Sequence[Complex]) -> Complex:
-    """Return the derivatives of a response by real and imaginary part of each pole, (n, 2 n_poles)."""
+    """Return the derivatives of a response by real and imaginary part and c of each pole, (n, 3 n_poles)."""
     n, slopes = len(up), []
     for r in range(n):
         one, other = own[r] * up[r], own[n + r] * down[r]
-        slopes += [one + other, 1j * (one - other)]
+        slopes += [one[1] + other[1], 1j * (one[1] - other[1]), one[2] + other[2]]
     return np.column_stack(slopes) if slopes else np.zeros((0, 0), dtype=np.complex128)
 
 
-def _basis(c: Course, poles: Complex, top: float) -> tuple[Complex, list[Complex], list[Complex]]:
-    """Return all columns (n, n_columns), and the slopes of those of poles and conjugate poles."""
-    both = [[c.pole(complex(x)) for x in group] for group in (poles, np.conj(poles))]
-    columns = [b for group in both for b, _ in group]
-    basis = np.column_stack([*columns, c.beyond(top)])
-    return basis, [d for _, d in both[0]], [d for _, d in both[1]]
+def _basis(c: Course, poles: Complex, moving: Array, top: float) -> tuple[Complex, list[Complex], list[Complex]]:
+    """Return all columns (n, n_columns), and what `Course.pole` says of poles and conjugate poles."""
+    up, down = ([c.pole(complex(x), float(m)) for x, m in zip(g, moving, strict=True)] for g in (poles, np.conj(poles)))
+    return np.column_stack([*(x[0] for x in (*up, *down)), c.beyond(top)]), up, down
 
 
 def _solve(basis: Complex, target: Complex) -> tuple[Complex, Complex]:
@@ -182,28 +190,23 @@ def _solve(basis: Complex, target: Complex) -> tuple[Complex, Complex]:
     return (weights.T / size).T, Q
 
 
-def fitted(courses: Sequence[Course], poles: Complex, *, steps: int = _STEPS) -> ModalFit:
+def fitted(courses: Sequence[Course], poles: Complex, moving: Array | None = None, *, steps: int = _STEPS) -> ModalFit:
     """Return the fit of some poles, from where they are given, by Gauss-Newton with damping (Kaufman 1975)."""
     top = max(float(c.speed.max()) for c in courses)
-    present, damping = _projected(courses, poles, top), 1e-3
+    damping = 1e-3
+    fit, left = _projected(courses, poles, np.ones(poles.size) if moving is None else moving, top)
     for _ in range(steps if poles.size else 0):
-        fit, left = present
         H, g = fit.J.T @ fit.J, fit.J.T @ left
-        better = False
-        while damping < 1e8:
+        before = fit.cost
+        while damping < 1e8 and fit.cost >= before:
             step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-            moved = _inside(fit.poles + step[0::2] + 1j * step[1::2], fit.poles, top)
-            trial = _projected(courses, moved, top)
-            if trial[0].cost < fit.cost:
-                better, damping = True, max(0.2 * damping, 1e-9)
-                break
+            moved = _inside(fit.poles + step[0::3] + 1j * step[1::3], fit.poles, top)
+            trial = _projected(courses, moved, np.clip(fit.moving + step[2::3], 0.5, 2.0), top)
             damping *= 5.0
-        if not better:
+            if trial[0].cost < before:
+                (fit, left), damping = trial, max(0.04 * damping, 1e-9)
+        if fit.cost > before * (1.0 - _STILL):
             break
-        gain, present = 1.0 - trial[0].cost / fit.cost, trial
-        if gain < _STILL:
-            break
-    fit = present[0]
     return fit
 
 
@@ -215,11 +218,11 @@ def _inside(poles: Complex, before: Complex, top: float) -> Complex:
     return np.asarray(real + 1j * np.minimum(imag, 2.0 * top))
 
 
-def _projected(courses: Sequence[Course], poles: Complex, top: float) -> tuple[ModalFit, Array]:
+def _projected(courses: Sequence[Course], poles: Complex, moving: Array, top: float) -> tuple[ModalFit, Array]:
     """Return the fit with all that is linear solved, and its residuals as real numbers."""
-    weights, left, J = [], [], []
+    weights, left, J = [], [], [np.zeros((0, 3 * poles.size), dtype=np.complex128)]
     for c in courses:
-        basis, up, down = _basis(c, poles, top)
+        basis, up, down = _basis(c, poles, moving, top)
         own = np.empty((basis.shape[1], c.amplitude.shape[1]), dtype=np.complex128)
         for k in range(c.amplitude.shape[1]):
             scaled, target = basis / c.sd[:, k, None], c.amplitude[:, k] / c.sd[:, k]
@@ -229,13 +232,14 @@ def _projected(courses: Sequence[Course], poles: Complex, top: float) -> tuple[M
                 s = _slopes(own[:, k], up, down) / c.sd[:, k, None]
                 J.append(-(s - Q @ (Q.conj().T @ s)))
         weights.append(own)
-    residual = np.concatenate(left)
-    slope = np.vstack(J) if J else np.zeros((residual.size, 0), dtype=np.complex128)
+    residual, slope = np.concatenate(left), np.vstack(J)
+    prior = np.kron(np.eye(poles.size), [0.0, 0.0, 1.0 / _MOVES])
+    real = np.concatenate([residual.real, residual.imag, (moving - 1.0) / _MOVES])
     fit = ModalFit(
-        poles=poles, courses=tuple(courses), top=top, weights=tuple(weights),
-        cost=float(np.sum(np.abs(residual) ** 2)), J=np.vstack([slope.real, slope.imag]),
+        poles=poles, moving=moving, courses=tuple(courses), top=top, weights=tuple(weights),
+        cost=float(real @ real), J=np.vstack([slope.real, slope.imag, prior]),
     )  # fmt: skip
-    return fit, np.concatenate([residual.real, residual.imag])
+    return fit, real
 
 
 def with_another(fit: ModalFit) -> ModalFit:
@@ -244,7 +248,7 @@ def with_another(fit: ModalFit) -> ModalFit:
     """
     best, prepared = (0.0, 0j), []
     for c, own in zip(fit.courses, fit.weights, strict=True):
-        basis = _basis(c, fit.poles, fit.top)[0]
+        basis = _basis(c, fit.poles, fit.moving, fit.top)[0]
         level = np.median(c.sd, axis=0)
         weight = (level / c.sd).mean(axis=1)[:, None]
         scaled = basis * weight
@@ -262,4 +266,4 @@ def with_another(fit: ModalFit) -> ModalFit:
                 gain += float(np.sum(np.abs(q.conj().T @ left) ** 2))
             if gain > best[0]:
                 best = gain, s
-    return fitted(fit.courses, np.append(fit.poles, best[1]))
+    return fitted(fit.courses, np.append(fit.poles, best[1]), np.append(fit.moving, 1.0))

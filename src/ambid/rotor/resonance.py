@@ -115,8 +115,8 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     fit = fitted(courses, np.zeros(0, dtype=np.complex128))
     while fit.poles.size < (_MODES if modes is None else modes):
         more = with_another(fit)
-        numbers = 2 + 4 * sum(c.amplitude.shape[1] for c in courses)
-        if modes is None and fit.cost - more.cost < numbers * np.log(fit.J.shape[0]) * max(more.misfit, 1.0):
+        numbers = 3 + 4 * sum(c.amplitude.shape[1] for c in courses)
+        if modes is None and fit.cost - more.cost < numbers * np.log(fit.size) * max(more.misfit, 1.0):
             break
         fit = more
     first = int(np.argmax([c.speed.size for c in courses]))
@@ -159,7 +159,7 @@ def _resonance(
 ) -> Resonance:  # fmt: skip
     """Return what is known of one pole."""
     s, residues = complex(fit.poles[r]), fit.weights[course][r]
-    own = fit.covariance[2 * r : 2 * r + 2, 2 * r : 2 * r + 2]
+    own = fit.covariance[3 * r : 3 * r + 2, 3 * r : 3 * r + 2]
     size = abs(s)
     along = np.array([s.real, s.imag]) / size  # |s| by real and imaginary part
     across = np.array([-1.0 / size + s.real**2 / size**3, s.real * s.imag / size**3])  # -Re s/|s|

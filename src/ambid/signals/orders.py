@@ -58,7 +58,8 @@ def track_orders(
     """
     first, stop = _blocks(angle, turns, 2 * len(orders) + 4)
     length = stop - first
-    time, speed = 0.5 * (first + stop - 1) / rate_hz, np.abs(angle[stop - 1] - angle[first]) / (length - 1) * rate_hz
+    time: Array = 0.5 * (first + stop - 1).astype(np.float64) / rate_hz
+    speed: Array = np.abs(angle[stop - 1] - angle[first]) / (length - 1) * rate_hz
     used = tuple(k for k in orders if k * speed.max() < 2.0 * np.pi * _TOP * rate_hz)
     if 1 not in used:
         raise EstimationError(
@@ -168,7 +169,7 @@ def waterfall(
     size = min(n, max(16, round(2.0 * rate_hz / resolution_hz)))  # two bins: the half width of the window
     starts = np.unique(np.linspace(0, n - size, max(1, spectra)).round().astype(np.int64))
     window = np.hanning(size + 1)[:-1]
-    frequency = np.fft.rfftfreq(size, 1.0 / rate_hz)
+    frequency: Array = np.arange(size // 2 + 1, dtype=np.float64) * (rate_hz / size)
     top = frequency.size if highest_hz is None else int(np.searchsorted(frequency, highest_hz, "right"))
     amplitude = np.empty((starts.size, top, y.shape[1]))
     for k, a in enumerate(starts):
