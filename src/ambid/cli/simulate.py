@@ -33,7 +33,7 @@ def command(v: Values) -> None:
 
     preset = preset_of(v.rig)
     if v.scenario is not None:
-        of_excitation = v.only("excitation band nonlinear position periods axes settle excitation_only")
+        of_excitation = v.only("run_up excitation band nonlinear position periods axes settle excitation_only")
         refuse_given(of_excitation, "--scenario takes no {}. Omit {}")
         _run_scenario(v, preset)
         return
@@ -41,24 +41,22 @@ def command(v: Values) -> None:
         refuse_given(v.only("position"), "{} is for --nonlinear. Omit {}")
     with Outputs(None if preset else Path(v.rig)) as outputs, progress("simulate"):
         outputs.claim(v.out, "out", _ENDINGS, force=v.force)
-        how = v.only("duration rate_hz excitation amplitude band periods seed settle closed nonlinear position")
-        how |= v.only("log_excitation force") | {"axes": None if v.axes is None else v.axes.split(",")}
+        how = v.only("duration rate_hz run_up excitation amplitude band periods seed settle closed nonlinear")
+        how |= v.only("position log_excitation force") | {"axes": None if v.axes is None else v.axes.split(",")}
         done, told = simulate_used(preset or Path(v.rig), **how)
         made = only_references(done.record) if v.excitation_only else done.record
         comments: tuple[str, ...] = ()
         if v.out.suffix not in (".h5", ".hdf5"):
             between = "" if v.band is None else f" in {v.band[0]:g}:{v.band[1]:g} Hz"
             comments = (
-                _recipe(v.rig, f"{told.kind} of {told.peak:.6g} {told.unit}{between}", v.seed),
+                _recipe(v.rig, f"{told.words(6)}{between}", v.seed),
                 f"truth: {truth_words(done)}",
             )
         outputs.stage(v.out, lambda path: write_record(made, path))
         outputs.stage_notes(v.out, comments)
     warn(done)
     n, rate_hz = done.record.n_samples, done.record.rate_hz
-    typer.echo(
-        f"{v.out}: {counted(n, 'sample')} at {rate_hz:g} Hz, {told.kind} of {told.peak:.4g} {told.unit}, seed {v.seed}"
-    )
+    typer.echo(f"{v.out}: {counted(n, 'sample')} at {rate_hz:g} Hz, {told.words()}, seed {v.seed}")
     typer.echo("truth: " + truth_words(done))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,12 +38,17 @@ from ambid.signals import excitation_of_axes
 from ambid.simulation.bench import Simulation
 from ambid.simulation.rig_bench import Bench, plant_of_law
 from ambid.simulation.rotor_bench import RotorBench
+from ambid.simulation.variation import Schedule
 
 BenchSource = RigSource | Preset | Estimate | NonlinearBearingEstimate
 """Who has the numbers of a bench: a preset by name, a rig in any form, an estimate of one axis, or a file of one."""
 
 LEAST_PERIODS = 4
 """Periods of a rotor's record: their scatter is its noise."""
+_RPM = 30.0 / math.pi
+_ONE_WAY_S = 20.0  # a run-up or a coast-down unless told otherwise
+_BEFORE_S = 0.5  # at the first speed, before the record begins
+_LOOKED_AT = 5  # speeds at which the loop of a run-up has to be stable
 _REACH = 10.0  # of the rate over the highest line of a rotor's excitation
 FRACTION = 0.5
 """Part of the limits that an amplitude chosen by the program uses."""
@@ -53,8 +59,12 @@ class Excited:
     """The excitation of a simulated record."""
 
     kind: str
-    peak: float  # in the unit of the input; rms of a gaussian
+    peak: float  # in the unit of the input; rms of a gaussian; 0: there is none
     unit: str = "V"
+
+    def words(self, digits: int = 4) -> str:
+        """Say what it is."""
+        return f"{self.kind} of {self.peak:.{digits}g} {self.unit}" if self.peak else self.kind
 
 
 @of_job("simulate")
@@ -69,6 +79,7 @@ def simulate(
     periods: int | None = None,
     axes: Sequence[str] | None = None,
     settle: int | None = None,
+    run_up: str | Sequence[float] | None = None,
     seed: int = 0,
     closed: bool | None = None,
     nonlinear: bool = False,
@@ -101,6 +112,9 @@ def simulate(
         Of a rotor: the axes that are excited; default all.
     settle : int, optional
         Of a rotor: periods that run before the record begins, so that it begins in steady state; default 1.
+    run_up : str or sequence of float, optional
+        Of a rotor, without excitation: speeds in rpm that it runs through evenly, (0, 20000) or ``"0:20000"`` for a
+        run-up, (20000, 0) for a coast-down. Channels ``angle`` and ``speed`` are logged; by default 20 s each way.
     seed : int, optional
         Seed of excitation and noise.
     closed : bool, optional
@@ -133,8 +147,8 @@ def simulate(
     """
     done, _ = simulate_used(
         source, duration=duration, rate_hz=rate_hz, excitation=excitation, amplitude=amplitude, band=band,
-        periods=periods, axes=axes, settle=settle, seed=seed, closed=closed, nonlinear=nonlinear, position=position,
-        log_excitation=log_excitation, force=force,
+        periods=periods, axes=axes, settle=settle, run_up=run_up, seed=seed, closed=closed, nonlinear=nonlinear,
+        position=position, log_excitation=log_excitation, force=force,
     )  # fmt: skip
     for line in done.warnings:
         warnings.warn(line, stacklevel=2)
@@ -152,6 +166,7 @@ def simulate_used(
     periods: int | None = None,
     axes: Sequence[str] | None = None,
     settle: int | None = None,
+    run_up: str | Sequence[float] | None = None,
     seed: int = 0,
     closed: bool | None = None,
     nonlinear: bool = False,
@@ -165,6 +180,11 @@ def simulate_used(
     check_band(band)
     check_number({"position": position})
     check_switch({"closed": closed})
+    if run_up is not None:
+        of_others = {"excitation": excitation, "amplitude": amplitude, "band": band, "periods": periods, "axes": axes,
+                     "settle": settle, "position": position, "log_excitation": log_excitation or None}  # fmt: skip
+        refuse_given(of_others, f"{setting('run_up')} takes no {{}}. Omit {{}}")
+        return _run_up(source, speeds_of(run_up), duration, rate_hz, seed, closed, nonlinear, force)
     bench, experiment = _bench(source, rate_hz, closed, nonlinear, position), experiment_of(excitation)
     if duration is None:
         duration = 1.0 if experiment is None else experiment.seconds
@@ -218,6 +238,39 @@ def simulate_used(
     peak = bench.largest(shape, seed, FRACTION) if amplitude is None else amplitude
     done = bench.simulate(peak * shape, seed=seed)
     return _with_excitation(done, peak * shape if log_excitation else None), Excited(kind=kind, peak=peak)
+
+
+def speeds_of(run_up: str | Sequence[float]) -> tuple[float, ...]:
+    """Return the speeds of a run-up in rpm."""
+    try:
+        speeds = tuple(float(x) for x in (run_up.split(":") if isinstance(run_up, str) else run_up))
+    except (TypeError, ValueError):
+        speeds = ()
+    if len(speeds) < 2 or not all(0.0 <= x < math.inf for x in speeds) or not any(speeds):
+        raise AmbidError(
+            f"{setting('run_up')} is {run_up!r:.40}; it must be two speeds in rpm or more, none negative, such as "
+            "0:20000. Correct it"
+        )
+    return speeds
+
+
+def _run_up(
+    source: BenchSource, rpm: tuple[float, ...], duration: float | None, rate: float | None, seed: int,
+    closed: bool | None, nonlinear: bool, force: bool,
+) -> tuple[Simulation, Excited]:  # fmt: skip
+    """Return a run through some speeds, and its words."""
+    speeds = [x / _RPM for x in rpm]
+    bench = _bench(source, rate, closed, nonlinear, None, speed=max(speeds))
+    if not isinstance(bench, RotorBench):
+        raise AmbidError(f"{setting('run_up')} is for a rotor on many axes. Omit it")
+    for speed in np.linspace(0.0, max(speeds), _LOOKED_AT) if not force else ():
+        bench.at_speed(float(speed)).refuse_unstable()
+    ways = len(speeds) - 1
+    n = samples_of(_ONE_WAY_S * ways if duration is None else duration, bench.rate_hz)
+    times = tuple((np.arange(ways + 1) * n / ways / bench.rate_hz).tolist())
+    course = Schedule(times_s=times, values=tuple(speeds))
+    words = f"run through {':'.join(f'{x:g}' for x in rpm)} rpm"
+    return bench.run_up(course, n, seed=seed, settle=round(_BEFORE_S * bench.rate_hz)), Excited(kind=words, peak=0.0)
 
 
 def _with_excitation(done: Simulation, wave: Array | None) -> Simulation:
@@ -285,9 +338,10 @@ def bench_of_source(source: BenchSource) -> Rig | Preset:
 
 
 def _bench(
-    given: BenchSource, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None
-) -> Bench | RotorBench:
-    """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
+    given: BenchSource, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None,
+    speed: float | None = None,
+) -> Bench | RotorBench:  # fmt: skip
+    """Return the bench of a preset or a rig, its rotor at a position, or at a speed in rad/s, where it is given."""
     source = bench_of_source(given)
     if isinstance(source, Preset):
         source = rig_of_preset(source) if source.rotor is not None else as_logged(source)
@@ -301,6 +355,7 @@ def _bench(
     if source.rotor is not None:
         if position is not None:
             raise AmbidError(f"{setting('position')} is for one axis. Omit it")
+        source = source if speed is None else replace(source, rotor=source.rotor.at_speed(speed))
         return RotorBench.of(source, rate, closed, nonlinear=nonlinear)
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 

@@ -116,13 +116,13 @@ class ModalFit:
     @property
     def size(self) -> int:
         """Number of real residuals."""
-        return sum(2 * c.amplitude.size for c in self.courses)
+        return int(sum(2 * c.amplitude.size for c in self.courses))
 
     @property
     def freedom(self) -> int:
         """Real residuals less numbers that are fitted."""
         columns = 2 * self.poles.size + _BEYOND
-        return self.size - 2 * self.poles.size - sum(2 * columns * c.amplitude.shape[1] for c in self.courses)
+        return self.size - 2 * self.poles.size - int(sum(2 * columns * c.amplitude.shape[1] for c in self.courses))
 
     @property
     def misfit(self) -> float:

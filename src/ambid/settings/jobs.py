@@ -264,7 +264,7 @@ _JOBS = (
     ),
     declare(
         "simulate",
-        "rig out duration rate_hz scenario excitation amplitude band periods axes settle excitation_only "
+        "rig out duration rate_hz scenario run_up excitation amplitude band periods axes settle excitation_only "
         "log_excitation seed closed nonlinear position force",
         rig={
             "help": "Rig file, or a bench that 'ambid models' lists.",

@@ -376,6 +376,13 @@ SETTINGS = (
     Setting("rig", "path", "RIG", "Rig file (TOML): what is known about the bench."),
     Setting("runs", "whole", "N", "Number of records.", least=1, default=100),
     Setting(
+        "run_up",
+        "text",
+        "RPM:RPM...",
+        "Speeds in rpm that a rotor runs through evenly, without excitation: 0:20000 is a run-up, 20000:0 a "
+        "coast-down, 0:20000:0 both; the record has its angle and speed.",
+    ),
+    Setting(
         "scenario",
         "text",
         "NAME[:SIZE][@S]",

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 _CHUNK = 16384  # samples whose noise is drawn at once
 _STRETCH = 200  # samples at one speed at most
 _PHASE = 1e-4  # rad by which the angle may leave that of a changing speed inside a stretch
+_CREEP = 1e-6  # rad/s
 _NODE = 20.0  # rad/s between speeds with exact matrices
 _SAME = 1e-3  # how well numbers of an axial axis have to agree with those of the cones
 
@@ -365,7 +366,8 @@ class RotorBench:
             slope = (w[end - 1] - w[begin]) / max(end - 1 - begin, 1) * self.rate_hz
             size = max(1, min(_STRETCH, int(self.rate_hz * math.sqrt(8.0 * _PHASE / max(abs(slope), 1e-9)))))
             speeds = np.linspace(w[begin], w[end - 1], 2 + int(abs(w[end - 1] - w[begin]) / _NODE))
-            nodes = [replace(self.at_speed(float(x)), acceleration=slope)._fixed for x in speeds]
+            turning = np.maximum(speeds, _CREEP)  # at rest the matrices have fewer entries
+            nodes = [replace(self.at_speed(float(x)), acceleration=slope)._fixed for x in turning]
             for first in range(begin, end, size):
                 stop = min(first + size, end)
                 middle = float(np.mean(w[first:stop]))
