@@ -15,7 +15,9 @@ from ambid.rotor.passage import Passage, whirl_of
 from ambid.rotor.passage_fit import Course, ModalFit, fitted, with_another
 
 _STANDS_OUT = 0.01  # of the largest value, by which a peak rises above what is around it
+_BULGE = 1.05  # of a parabola over its highest point
 _MODES = 8  # at most
+_SMOOTH, _WORTH = 0.1, 3.0  # damping ratio above which a mode may gain less, for each of its numbers
 _GRID = 600  # speeds
 _DRAWS = 60  # of the response, for intervals
 _NEAR, _WIDTHS = 0.03, 1.5  # of the frequency, and damping ratios, within which a peak belongs to a pole
@@ -59,10 +61,13 @@ def _prominence(y: Array, k: int) -> float:
 
 def _peak_at(x: Array, y: Array, k: int) -> Peak:
     """Return the peak around a largest value: the top of a parabola, and where it falls to 1/√2 of that."""
-    a, b, c = np.polyfit(x[k - 1 : k + 2] - x[k], y[k - 1 : k + 2], 2)
-    shift = -b / (2.0 * a) if a < 0.0 else 0.0
-    shift = shift if x[k - 1] - x[k] <= shift <= x[k + 1] - x[k] else 0.0
-    top = float(c + b * shift + a * shift**2)
+    (left, right), (low, high) = x[[k - 1, k + 1]] - x[k], y[[k - 1, k + 1]] - y[k]
+    bend = (low / left - high / right) / (left - right)
+    slope = low / left - bend * left
+    shift = float(np.clip(-0.5 * slope / bend, left, right)) if bend < 0.0 else 0.0
+    top = float(y[k] + shift * (slope + bend * shift))
+    if not y[k] <= top <= _BULGE * y[k]:
+        shift, top = 0.0, float(y[k])
     ends = []
     for step in (-1, 1):
         m = k
@@ -116,7 +121,9 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     while fit.poles.size < (_MODES if modes is None else modes):
         more = with_another(fit)
         numbers = 3 + 4 * sum(c.amplitude.shape[1] for c in courses)
-        if modes is None and fit.cost - more.cost < numbers * np.log(fit.size) * max(more.misfit, 1.0):
+        smooth = -more.poles[-1].real > _SMOOTH * abs(more.poles[-1])  # noise is more often taken for narrow ones
+        worth = numbers * (_WORTH if smooth else np.log(fit.size)) * max(more.misfit, 1.0)
+        if modes is None and fit.cost - more.cost < worth:
             break
         fit = more
     first = int(np.argmax([c.speed.size for c in courses]))
@@ -307,22 +314,3 @@ def scaled_to_limit(
         factor=factor, at=float(speed[k]), largest=factor * float(size[top]), largest_at=float(speed[top]), room=room,
         passed=factor * float(size[top]) <= room,
     )  # fmt: skip
-
-
-# --- whirl at constant speed ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WhirlPoint:
-    """A mode that noise excites in a record at constant speed: a point of a measured Campbell diagram."""
-
-    speed: float  # rad/s
-    frequency: EstimatedNumber  # rad/s
-    damping: EstimatedNumber  # ratio
-    direction: int  # 1 forward, -1 backward, 0 of one plane alone
-    plane: str
-
-
-def whirl_points(passages: Sequence[object]) -> tuple[WhirlPoint, ...]:
-    """Return the modes that noise shows in records at constant speed."""
-    raise NotImplementedError

@@ -1,0 +1,185 @@
+"""Points of a measured Campbell diagram: modes of the loop that noise excites in records at constant speed, forward and
+backward, by the spectrum of x + jy without its synchronous part and without what an excitation repeats.
+
+Around a pole the spectrum is B (1 + (A s² + C s u)/(u² + s²)), u = w - w_0: the second part where sensors are noisy, to
+which the loop reacts. It is fitted by Whittle's likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.estimation.modes import EstimatedNumber
+from ambid.physics.rotor_model import RotorModel, position_role
+from ambid.record import Record
+from ambid.rotor.synchronous import aperiodic, separate
+
+_SEGMENTS = 16  # of the averaged spectrum in which peaks are sought
+_STANDS_OUT = 2.0  # over the median around
+_AROUND = 0.15  # of the frequency on either side, for that median
+_TAPER = 0.1  # of the record at both ends
+_WIDTHS = 8.0  # half widths on either side that are fitted
+_BINS = 30  # at least
+_STEPS = 60
+_GAIN = 20.0  # logarithm of the likelihood over that of a level alone
+_TONE = 2.0  # bins: a peak that is not wider is a line, no mode
+_DAMPED = 0.2  # damping ratio up to which a peak is that of a mode
+_SAME = 0.01  # of the frequency, within which two planes show one mode
+_TOP = 0.35  # of the rate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WhirlPoint:
+    """A mode that noise excites in a record at constant speed: a point of a measured Campbell diagram."""
+
+    speed: float  # rad/s
+    frequency: EstimatedNumber  # damped, rad/s
+    damping: EstimatedNumber  # ratio
+    direction: int  # 1 forward, -1 backward, 0 of one axis alone
+    plane: str  # of sensors, or the axis
+
+
+def whirl_points(record: Record, model: RotorModel) -> tuple[WhirlPoint, ...]:
+    """Return the modes that noise shows in a record at constant speed, by frequency; modes with a damping ratio above
+    0.2 make no peak, and are not sought.
+    """
+    apart = separate(record, model)
+    clean, excitation, speed = apart.record, apart.excitation, apart.speed
+    points: list[WhirlPoint] = []
+    for name, roles in _planes(model, record):
+        y = np.column_stack([clean[role].values for role in roles])
+        if excitation is not None:
+            y = y[excitation.first : excitation.first + excitation.period * excitation.count]
+            y = aperiodic(y, np.zeros(0, dtype=np.intp), excitation.count)
+        z = y - y.mean(axis=0)
+        motion = z[:, 0] + 1j * z[:, 1] if len(roles) == 2 else z[:, 0].astype(np.complex128)
+        points += _of_motion(motion, record.rate_hz, speed, name, two=len(roles) == 2)
+    points.sort(key=lambda p: p.frequency.sd / p.frequency.value)
+    kept: list[WhirlPoint] = []
+    for p in points:
+        like = (
+            q for q in kept if q.direction == p.direction
+            and abs(q.frequency.value - p.frequency.value) < _SAME * q.frequency.value
+        )  # fmt: skip
+        if next(like, None) is None:
+            kept.append(p)
+    return tuple(sorted(kept, key=lambda p: p.frequency.value))
+
+
+def _planes(model: RotorModel, record: Record) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the positions of each plane of sensors, x and y or one."""
+    planes = []
+    for b in model.bearings:
+        for k in range(len(b.z_sensors)):
+            roles = tuple(position_role(axis, k) for axis in b.axes if position_role(axis, k) in record)
+            if roles:
+                planes.append((b.name if k == 0 else f"{b.name} {k + 1}", roles))
+    return planes
+
+
+def _of_motion(motion: Complex, rate_hz: float, speed: float, plane: str, *, two: bool) -> list[WhirlPoint]:
+    """Return the peaks of one motion."""
+    n, points = motion.size, []
+    taper = _tukey(n)
+    power = np.abs(np.fft.fft(motion * taper)) ** 2 / float(taper @ taper)
+    inflation = n * float(np.sum(taper**4)) / float(taper @ taper) ** 2
+    smooth, size = _averaged(motion)
+    bins = 2.0 * np.pi * rate_hz / n
+    for direction in (1, -1) if two else (0,):
+        way = -1 if direction * np.sign(speed or 1.0) < 0 else 1
+        side = smooth[: size // 2] if way > 0 else smooth[:0:-1][: size // 2]
+        mine = power[: n // 2] if way > 0 else np.concatenate([power[:1], power[:0:-1]])[: n // 2]
+        for k, width in _tops(side, size):
+            fit = _lorentzian(mine, k * n / size, width * n / size)
+            if fit is None:
+                continue
+            (at, half), covariance = fit
+            sd = np.sqrt(np.diag(covariance) * inflation) * bins
+            w, s = at * bins, half * bins
+            ratio = s / np.hypot(w, s)
+            if half > _TONE and ratio < _DAMPED and w < 2.0 * np.pi * _TOP * rate_hz:
+                points.append(
+                    WhirlPoint(
+                        speed=abs(speed), frequency=EstimatedNumber.of(w, float(sd[0])),
+                        damping=EstimatedNumber.of(float(ratio), float(sd[1] / w)), direction=direction, plane=plane,
+                    )
+                )  # fmt: skip
+    return [p for p in points if p.frequency.identifiable and p.damping.identifiable]
+
+
+def _tukey(n: int) -> Array:
+    """Return a window that is flat but at its ends."""
+    edge = max(2, int(_TAPER * n))
+    rise = 0.5 * (1.0 - np.cos(np.pi * (np.arange(edge) + 0.5) / edge))
+    return np.concatenate([rise, np.ones(n - 2 * edge), rise[::-1]])
+
+
+def _averaged(motion: Complex) -> tuple[Array, int]:
+    """Return the spectrum averaged over overlapping segments, (size,), and its size."""
+    size = 2 * motion.size // (_SEGMENTS + 1) // 2 * 2
+    window = np.hanning(size + 1)[:-1]
+    starts = range(0, motion.size - size + 1, size // 2)
+    return np.mean([np.abs(np.fft.fft(motion[a : a + size] * window)) ** 2 for a in starts], axis=0), size
+
+
+def _tops(side: Array, size: int) -> list[tuple[int, float]]:
+    """Return the bins that stand out, with half their width."""
+    tops = []
+    for k in range(8, int(_TOP * size)):
+        reach = max(12, int(_AROUND * k))
+        near = side[max(1, k - 3) : k + 4]
+        if side[k] < near.max() or side[k] < _STANDS_OUT * float(np.median(side[max(1, k - reach) : k + reach])):
+            continue
+        below = np.flatnonzero(side[k:] < 0.5 * side[k])
+        tops.append((k, max(1.0, float(below[0]) if below.size else 1.0)))
+    return tops
+
+
+def _lorentzian(power: Array, at: float, half: float) -> tuple[Array, Array] | None:
+    """Return place and half width of a peak in bins, with their covariance, by scoring; None without one."""
+    reach = max(_BINS, int(_WIDTHS * half))
+    first, stop = max(1, int(at) - reach), min(power.size, int(at) + reach)
+    x, seen = np.arange(first, stop, dtype=np.float64), power[first:stop]
+    if x.size < 2 * _BINS:
+        return None
+    level = float(np.median(seen)) / np.log(2.0)
+    height = max(float(np.mean(seen[np.abs(x - at) <= half + 1.0])) / level, 2.0)
+    p = np.array([at, np.log(half), height, 0.0, np.log(level)])
+
+    def spectrum(p: Array) -> tuple[Array, Array]:
+        """Return the spectrum and its logarithmic derivatives."""
+        s, u = np.exp(p[1]), x - p[0]
+        size = u**2 + s**2
+        S = 1.0 + (p[2] * s**2 + p[3] * s * u) / size
+        by_u = p[3] * s / size - 2.0 * u * (p[2] * s**2 + p[3] * s * u) / size**2
+        by_s = (2.0 * p[2] * s**2 + p[3] * s * u) / size - 2.0 * s**2 * (p[2] * s**2 + p[3] * s * u) / size**2
+        return np.exp(p[4]) * S, np.array([-by_u / S, by_s / S, s**2 / size / S, s * u / size / S, np.ones(x.size)])
+
+    def likelihood(p: Array) -> float:
+        S = spectrum(p)[0]
+        return -float(np.sum(np.log(S) + seen / S)) if S.min() > 0.0 else -np.inf
+
+    present = likelihood(p)
+    for _ in range(_STEPS):
+        S, rows = spectrum(p)
+        F = rows @ rows.T
+        step = np.linalg.solve(F + 1e-9 * np.diag(np.diag(F)), rows @ (seen / S - 1.0))
+        room = np.array([half, 1.0, 1.0 + abs(p[2]), 1.0 + abs(p[2]), 1.0])
+        step *= min(1.0, 1.0 / max(float((np.abs(step) / room).max()), 1e-300))
+        while likelihood(p + step) < present and np.abs(step).max() > 1e-9:
+            step *= 0.5
+        p = p + step
+        before, present = present, likelihood(p)
+        if present - before < 1e-9 * abs(present):
+            break
+    flat = -float(np.sum(np.log(seen.mean()) + seen / seen.mean()))
+    if present - flat < _GAIN or not first < p[0] < stop or p[2] <= 0.0:
+        return None
+    rows = spectrum(p)[1]
+    covariance = np.linalg.pinv(rows @ rows.T)[:2, :2]
+    half = float(np.exp(p[1]))
+    scale = np.array([1.0, half])
+    return np.array([p[0], half]), covariance * np.outer(scale, scale)
