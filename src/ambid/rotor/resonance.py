@@ -15,6 +15,7 @@ from ambid.rotor.passage import Passage, whirl_of
 from ambid.rotor.passage_fit import Course, ModalFit, fitted, with_another
 
 _STANDS_OUT = 0.01  # of the largest value, by which a peak rises above what is around it
+_APART = 1e-9  # of the highest speed, up to which two are one
 _BULGE = 1.05  # of a parabola over its highest point
 _MODES = 8  # at most
 _SMOOTH, _WORTH = 0.1, 3.0  # damping ratio above which a mode may gain less, for each of its numbers
@@ -45,6 +46,8 @@ def peaks(speed: Array, size: Array) -> tuple[Peak, ...]:
     """Return the peaks of a response (n,) over the speed in rad/s, in any order, by rising speed."""
     order = np.argsort(speed, kind="stable")
     x, y = speed[order], size[order]
+    apart = np.diff(x, prepend=-np.inf) > _APART * np.abs(x).max(initial=0.0)  # a speed that is held counts once
+    x, y = x[apart], y[apart]
     tops = np.flatnonzero((y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:])) + 1
     least = _STANDS_OUT * float(y.max(initial=0.0))
     return tuple(_peak_at(x, y, int(k)) for k in tops if _prominence(y, int(k)) >= least)
@@ -121,8 +124,9 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     while fit.poles.size < (_MODES if modes is None else modes):
         more = with_another(fit)
         numbers = 3 + 4 * sum(c.amplitude.shape[1] for c in courses)
-        smooth = -more.poles[-1].real > _SMOOTH * abs(more.poles[-1])  # noise is more often taken for narrow ones
-        worth = numbers * (_WORTH if smooth else np.log(fit.size)) * max(more.misfit, 1.0)
+        narrow = [int(np.sum(-p.real < _SMOOTH * np.abs(p))) for p in (fit.poles, more.poles)]
+        each = np.log(fit.size) if narrow[1] > narrow[0] else _WORTH  # noise looks like narrow ones more often
+        worth = numbers * each * max(more.misfit, 1.0)
         if modes is None and fit.cost - more.cost < worth:
             break
         fit = more
