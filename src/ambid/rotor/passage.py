@@ -94,6 +94,11 @@ class Passage:
         """Whether the rotor runs up, over all."""
         return bool(self.speed[-1] > self.speed[0])
 
+    @property
+    def ways(self) -> tuple[Passage, ...]:
+        """The run-ups and coast-downs in it, in their order."""
+        return tuple(replace(self, orders=part) for part in self.orders.ways())
+
     @cached_property
     def amplitude(self) -> Complex:
         """Synchronous amplitudes without slow roll, (n, n_roles), m: x(t) = Re a exp(j angle)."""

@@ -16,7 +16,7 @@ derivatives of exp(j angle) for what lies outside the range. Every column is ave
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,8 @@ _REACH = 1.3  # of the highest speed, up to which poles are sought
 _STEPS = 40
 _STILL = 1e-9  # relative change of the sum of squares
 _MOVES = 0.15  # prior standard deviation of c
+_FLOOR = 1e-6  # of the largest amplitude
+_AROUND = 30  # blocks on either side that show the noise
 _RANK = 1e-10  # of the largest singular value of the columns
 
 
@@ -72,12 +74,16 @@ class Course:
         """Return what is fitted: the synchronous amplitudes with what slow roll is in them."""
         orders = passage.orders
         amplitude, sd = orders.of(1)
-        floor = 1e-6 * np.abs(amplitude).max(axis=0)
         half = 0.5 * (orders.stop - orders.first).astype(np.float64) / orders.rate_hz
         return cls(
             speed=orders.speed, acceleration=orders.acceleration, half=half, amplitude=amplitude,
-            sd=np.maximum(sd, floor),
+            sd=np.maximum(sd, _FLOOR * np.abs(amplitude).max(axis=0)),
         )  # fmt: skip
+
+    @property
+    def floor(self) -> Array:
+        """Least standard deviation, (n_roles,)."""
+        return np.asarray(_FLOOR * np.abs(self.amplitude).max(axis=0))
 
     @cached_property
     def _points(self) -> list[tuple[float, Array]]:
@@ -240,6 +246,22 @@ def _projected(courses: Sequence[Course], poles: Complex, moving: Array, top: fl
         cost=float(real @ real), J=np.vstack([slope.real, slope.imag, prior]),
     )  # fmt: skip
     return fit, real
+
+
+def reweighted(fit: ModalFit) -> ModalFit:
+    """Return the fit with the noise that its own residuals show, smoothed over blocks: it is known better than by
+    differences, which take neighbours for alike.
+    """
+    courses = []
+    for c, own in zip(fit.courses, fit.weights, strict=True):
+        n = c.speed.size
+        reach, length = min(_AROUND, n // 4), c.half[:, None]
+        power = 0.5 * np.abs(c.amplitude - _basis(c, fit.poles, fit.moving, fit.top)[0] @ own) ** 2 * length
+        wide = np.pad(power, ((reach, reach), (0, 0)), mode="reflect")
+        mean = np.lib.stride_tricks.sliding_window_view(wide, 2 * reach + 1, axis=0).mean(axis=-1)
+        lost = 1.0 - (own.shape[0] + fit.poles.size / own.shape[1]) / n
+        courses.append(replace(c, sd=np.maximum(np.sqrt(mean / length / max(lost, 0.1)), c.floor)))
+    return fitted(courses, fit.poles, fit.moving)
 
 
 def with_another(fit: ModalFit) -> ModalFit:

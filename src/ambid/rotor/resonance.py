@@ -12,7 +12,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.modes import EstimatedNumber
 from ambid.estimation.result import NORMAL_95
 from ambid.rotor.passage import Passage, whirl_of
-from ambid.rotor.passage_fit import Course, ModalFit, fitted, with_another
+from ambid.rotor.passage_fit import Course, ModalFit, fitted, reweighted, with_another
 
 _STANDS_OUT = 0.01  # of the largest value, by which a peak rises above what is around it
 _APART = 1e-9  # of the highest speed, up to which two are one
@@ -99,7 +99,7 @@ class Resonance:
     pole: complex  # rad/s
     shape: Mapping[str, complex]  # by position, largest 1: the motion that goes with the mode
     forward: float | None  # part of the shape's power that whirls forward; None: of one plane
-    measured: Peak | None  # the peak of the tracked response itself, as it was passed
+    measured: Peak | None  # the peak of the tracked response itself, as the longest way passed it
     plane: str  # whose response shows it most
 
 
@@ -119,6 +119,7 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     """Return the resonances of passages of one machine, up or down; `least`: AF below which a mode is critically
     damped; `modes`: how many are fitted, by default as many as the data ask for.
     """
+    passages = [way for p in passages for way in p.ways]
     courses = [Course.of(p) for p in passages]
     fit = fitted(courses, np.zeros(0, dtype=np.complex128))
     while fit.poles.size < (_MODES if modes is None else modes):
@@ -130,6 +131,8 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
         if modes is None and fit.cost - more.cost < worth:
             break
         fit = more
+    misfit, fit = fit.misfit, reweighted(fit)
+    courses = list(fit.courses)
     first = int(np.argmax([c.speed.size for c in courses]))
     low, high = min(c.speed.min() for c in courses), max(c.speed.max() for c in courses)
     speed = _grid(fit.poles, float(low), float(high))
@@ -142,8 +145,8 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
             if not one.critically_damped or one.damping.identifiable:
                 modal.append(one)
     return Resonances(
-        resonances=tuple(modal), speed=speed, response=response, roles=passage.roles, misfit=fit.misfit,
-        warnings=tuple(_warnings(fit, passages)),
+        resonances=tuple(modal), speed=speed, response=response, roles=passage.roles, misfit=misfit,
+        warnings=tuple(_warnings(fit.poles.size, misfit, passages)),
     )  # fmt: skip
 
 
@@ -210,12 +213,12 @@ def _inverse(damping: EstimatedNumber) -> EstimatedNumber:
     return EstimatedNumber.of(0.5 / damping.value, 0.5 * damping.sd / damping.value**2)
 
 
-def _warnings(fit: ModalFit, passages: Sequence[Passage]) -> list[str]:
+def _warnings(modes: int, misfit: float, passages: Sequence[Passage]) -> list[str]:
     """Return what is doubtful of a fit."""
     warnings = []
-    if fit.misfit > _MISFIT:
+    if misfit > _MISFIT:
         warnings.append(
-            f"{fit.poles.size} modes leave {fit.misfit:.3g} times the noise of the synchronous response; the intervals "
+            f"{modes} modes leave {misfit:.3g} times the noise of the synchronous response; the intervals "
             "are widened by that. Look at the run-up for what changes on the way"
         )
     if any(p.source == "speed" for p in passages):

@@ -7,7 +7,8 @@ In a block order 1 may change linearly, so that its amplitude is the mean over t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,8 @@ _CHUNK = 200_000  # samples that are worked on at once
 _PER_COLUMN = 2.0  # samples of a block for each column of its regression, at least
 _CHANGES = 0.25  # of the speed within a block, relative, at most: the first turns from rest are left out
 _LEAST = 8  # blocks
-_AROUND = 10  # blocks on either side that show the noise
+_TURNS_BACK = 0.1  # of the highest speed, by which a run-up becomes a coast-down
+_AROUND = 15  # blocks on either side that show the noise
 _TOP = 0.45  # of the rate, up to which an order is tracked
 _DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)  # what is smooth over five blocks drops out
 
@@ -43,6 +45,25 @@ class Orders:
     def bandwidth_hz(self) -> Array:
         """What a block resolves, one over its length: (n_blocks,)."""
         return np.asarray(self.rate_hz / (self.stop - self.first))
+
+    def part(self, blocks: slice) -> Orders:
+        """Return some blocks."""
+        arrays = ("first", "stop", "time_s", "speed", "acceleration", "amplitude", "sd", "mean")
+        return replace(self, **{name: getattr(self, name)[blocks] for name in arrays})
+
+    def ways(self) -> tuple[Orders, ...]:
+        """Return the stretches between which the speed turns back by more than a part of its highest."""
+        w, least = self.speed, _TURNS_BACK * float(self.speed.max())
+        edges, way, extreme = [0], 0, 0
+        for k in range(w.size):
+            far = w[k] - w[extreme]
+            if way * far >= 0.0 and way:
+                extreme = k
+            elif abs(far) > least:
+                if way:
+                    edges.append(extreme)
+                way, extreme = (1 if far > 0.0 else -1), k
+        return tuple(self.part(slice(a, b)) for a, b in pairwise([*edges, w.size]) if b - a >= _LEAST)
 
     def of(self, order: int = 1) -> tuple[Complex, Array]:
         """Return amplitudes and standard deviations (n_blocks, n_channels) of an order."""
@@ -74,7 +95,7 @@ def track_orders(
     amplitude = solved[:, at] + 1j * solved[:, at + 1]
     return Orders(
         first=first, stop=stop, time_s=time, speed=speed,
-        acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude, sd=_scatter(amplitude),
+        acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude, sd=_scatter(amplitude, length),
         mean=solved[:, 0], rate_hz=rate_hz,
     )  # fmt: skip
 
@@ -136,16 +157,17 @@ def _solved(y: Array, angle: Array, first: NDArray[np.int64], stop: NDArray[np.i
     return np.asarray(np.linalg.solve(gram, right))
 
 
-def _scatter(amplitude: Complex) -> Array:
-    """Return the standard deviation of real and imaginary part by the fourth difference of five blocks, the median over
-    some blocks around: what changes smoothly, or in a narrow resonance, is no noise.
+def _scatter(amplitude: Complex, length: NDArray[np.int64]) -> Array:
+    """Return the standard deviation of real and imaginary part by the fourth difference of five blocks: of its power
+    for one sample the median over blocks around, in which what changes smoothly, or in a narrow resonance, is no noise.
     """
-    n = amplitude.shape[0]
-    power = sum(c * amplitude[k : n - 4 + k] for k, c in enumerate(_DIFFERENCE))
-    size = np.abs(np.pad(power, ((2, 2), (0, 0), (0, 0)), mode="edge")) ** 2
-    wide = np.pad(size, ((_AROUND, _AROUND), (0, 0), (0, 0)), mode="reflect" if n > _AROUND else "edge")
-    window = np.lib.stride_tricks.sliding_window_view(wide, 2 * _AROUND + 1, axis=0)
-    return np.asarray(np.sqrt(np.median(window, axis=-1) / (2.0 * np.log(2.0))))
+    n, share = amplitude.shape[0], np.sqrt(length)[:, None, None]
+    power = sum(c * (amplitude * share)[k : n - 4 + k] for k, c in enumerate(_DIFFERENCE))
+    size = np.pad(np.abs(power) ** 2, ((2, 2), (0, 0), (0, 0)), mode="edge")
+    reach = min(_AROUND, n - 1)
+    wide = np.pad(size, ((reach, reach), (0, 0), (0, 0)), mode="reflect")
+    window = np.lib.stride_tricks.sliding_window_view(wide, 2 * reach + 1, axis=0)
+    return np.asarray(np.sqrt(np.median(window, axis=-1) / (2.0 * np.log(2.0))) / share)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
