@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid import simulate
-from ambid.errors import ModelError, RigError
+from ambid.errors import AmbidError, ModelError, RigError
 from ambid.job.simulation import simulate_used
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.law_magnet import LawMagnet
@@ -16,9 +16,9 @@ from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.rig import RigChannel, preset_text, rig_from_text, rig_of_preset
 from ambid.signals import excitation_of_axes, multisine
-from ambid.simulation import LinearPlant
+from ambid.simulation import LinearPlant, Schedule, rotor_bench
 from ambid.simulation import simulate as simulate_plant
-from ambid.simulation.rotor_bench import RotorBench
+from ambid.simulation.rotor_bench import RotorBench, poles_of
 from tests.rotor_benches import needs_simulator, rig_of, truth
 
 QUIET = {"position_noise": 0.0, "current_noise": 0.0, "voltage_noise": 0.0, "force_noise": 0.0}
@@ -202,3 +202,41 @@ def test_magnets_that_cannot_be_are_refused() -> None:
     refuse(preset("camb"), r"az\.k_i is 50; with this cone", **{"az.k_i": 50.0})
     with pytest.raises(RigError, match="there is no gap"):
         simulate(replace(rig_of_preset(preset("rmit")), magnet=None), duration=0.1, nonlinear=True)
+
+
+def _quiet_bench(name: str) -> RotorBench:
+    return RotorBench.of(replace(rig_of_preset(preset(name)), noise=Noise()), None, True)
+
+
+def test_a_run_up_that_stays_at_one_speed_is_the_simulation_at_that_speed() -> None:
+    bench = _quiet_bench("utrc")
+    speed = Schedule(times_s=(0.0, 0.5), values=(bench.model.speed, bench.model.speed))
+    for one in (bench, replace(bench, poles=poles_of(bench.rig, bench.model, bench.plant.parameters))):
+        ran = one.run_up(speed, 3000, seed=1, settle=2000)
+        stood = one.simulate(np.zeros((5000, 4)), seed=1, settle=2000, columns=False)
+        assert np.abs(ran.states - stood.states).max() < 1e-5 * np.abs(stood.states).max()
+        assert ran.record["speed"].values == pytest.approx(bench.model.speed)
+        assert "ax_reference" in ran.record.names  # the rig names it
+
+
+def test_stretches_of_a_run_up_are_short_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, top = _quiet_bench("utrc"), 20_000.0 * np.pi / 30.0
+    course = Schedule(times_s=(0.0, 0.2, 0.3), values=(0.0, top, top))
+    rough = bench.run_up(course, 6000, seed=1)
+    monkeypatch.setattr(rotor_bench, "_PHASE", 1e-9)  # one sample each
+    fine = bench.run_up(course, 6000, seed=1)
+    assert np.abs(rough.states - fine.states).max() < 5e-4 * np.abs(fine.states).max()
+    w, angle = fine.record["speed"].values, fine.record["angle"].values
+    assert np.abs(np.gradient(angle) * 20_000.0 - w)[5:-5].max() < 0.2
+
+
+def test_run_ups_that_cannot_be_simulated_are_refused() -> None:
+    for speeds in ("0", "0:x", (0.0, -5.0), (0.0, 0.0)):
+        with pytest.raises(AmbidError, match=r"two speeds in rpm or more"):
+            simulate("utrc", run_up=speeds)
+    with pytest.raises(AmbidError, match="run_up takes no band"):
+        simulate("utrc", run_up="0:1000", band=(1.0, 2.0))
+    with pytest.raises(AmbidError, match="for a rotor on many axes"):
+        simulate("thesis", run_up="0:1000")
+    with pytest.raises(RigError, match="no value for Ip"):
+        simulate("rmit", run_up="0:1000")

@@ -182,4 +182,4 @@ def _lorentzian(power: Array, at: float, half: float) -> tuple[Array, Array] | N
     covariance = np.linalg.pinv(rows @ rows.T)[:2, :2]
     half = float(np.exp(p[1]))
     scale = np.array([1.0, half])
-    return np.array([p[0], half]), covariance * np.outer(scale, scale)
+    return np.array([p[0], half]), np.asarray(covariance * np.outer(scale, scale), dtype=np.float64)
