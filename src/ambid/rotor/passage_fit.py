@@ -157,7 +157,10 @@ class ModalFit:
         """Return `n` responses at constant speeds as they may be by the uncertainty of poles and weights."""
         c, size = self.courses[course], np.sqrt(max(self.misfit, 1.0))
         values, vectors = np.linalg.eigh(self.covariance)
-        steps = rng.standard_normal((n, values.size)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        even = rng.standard_normal((n, values.size))
+        even -= even.mean(axis=0)
+        U, _, Vh = np.linalg.svd(even, full_matrices=False)  # with exactly the covariance, however few they are
+        steps = np.sqrt(n) * U @ Vh * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
         basis, up, down = _basis(c, self.poles, self.moving, self.top)
         parts = []
         for k in range(c.amplitude.shape[1]):
