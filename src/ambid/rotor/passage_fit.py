@@ -23,6 +23,7 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.rotor.passage import Passage
+from ambid.signals.orders import blocks_around
 
 _SERIES = 2e-3  # |W'|/|D|² up to which a series replaces the Faddeeva function
 _GAUSS = ((-0.7745966692414834, 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.7745966692414834, 5.0 / 18.0))
@@ -257,11 +258,9 @@ def reweighted(fit: ModalFit) -> ModalFit:
     """
     courses = []
     for c, own in zip(fit.courses, fit.weights, strict=True):
-        n = c.speed.size
-        reach, length = min(_AROUND, n // 4), c.half[:, None]
+        n, length = c.speed.size, c.half[:, None]
         power = 0.5 * np.abs(c.amplitude - _basis(c, fit.poles, fit.moving, fit.top)[0] @ own) ** 2 * length
-        wide = np.pad(power, ((reach, reach), (0, 0)), mode="reflect")
-        mean = np.lib.stride_tricks.sliding_window_view(wide, 2 * reach + 1, axis=0).mean(axis=-1)
+        mean = np.array([power[a:b].mean(axis=0) for a, b in blocks_around(c.speed, _AROUND)])
         lost = 1.0 - (own.shape[0] + fit.poles.size / own.shape[1]) / n
         courses.append(replace(c, sd=np.maximum(np.sqrt(mean / length / max(lost, 0.1)), c.floor)))
     return fitted(courses, fit.poles, fit.moving)

@@ -19,6 +19,7 @@ _APART = 1e-9  # of the highest speed, up to which two are one
 _BULGE = 1.05  # of a parabola over its highest point
 _MODES = 8  # at most
 _SMOOTH, _WORTH = 0.1, 3.0  # damping ratio above which a mode may gain less, for each of its numbers
+_BLOCKS = 24  # that a passage needs, for two modes
 _GRID = 600  # speeds
 _DRAWS = 100  # of the response, for intervals
 _NEAR, _WIDTHS = 0.03, 1.5  # of the frequency, and damping ratios, within which a peak belongs to a pole
@@ -120,9 +121,13 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     damped; `modes`: how many are fitted, by default as many as the data ask for.
     """
     passages = [way for p in passages for way in p.ways]
-    courses = [Course.of(p) for p in passages]
+    courses, fewest = [Course.of(p) for p in passages], min((p.speed.size for p in passages), default=0)
+    if fewest < _BLOCKS:
+        raise EstimationError(
+            f"a run-up has {fewest} blocks of whole turns; resonances need {_BLOCKS}. Run up more slowly, or further"
+        )
     fit = fitted(courses, np.zeros(0, dtype=np.complex128))
-    while fit.poles.size < (_MODES if modes is None else modes):
+    while fit.poles.size < min(_MODES if modes is None else modes, fewest // _BLOCKS * 2):
         more = with_another(fit)
         numbers = 3 + 4 * sum(c.amplitude.shape[1] for c in courses)
         narrow = [int(np.sum(-p.real < _SMOOTH * np.abs(p))) for p in (fit.poles, more.poles)]
@@ -138,15 +143,17 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     speed = _grid(fit.poles, float(low), float(high))
     response = fit.response(speed, first)
     draws = fit.drawn(np.random.default_rng(0), speed, _DRAWS, first)
-    passage, modal = passages[first], []
+    passage, modal, unsure = passages[first], [], []
     for r in np.argsort(np.abs(fit.poles)):
         if low <= np.abs(fit.poles[r]) <= high:
             one = _resonance(fit, int(r), passage, first, speed, response, draws, least)
-            if not one.critically_damped or one.damping.identifiable:
+            if one.damping.identifiable:
                 modal.append(one)
+            elif one.damping.value < _SMOOTH:
+                unsure.append(one)
     return Resonances(
         resonances=tuple(modal), speed=speed, response=response, roles=passage.roles, misfit=misfit,
-        warnings=tuple(_warnings(fit.poles.size, misfit, passages)),
+        warnings=tuple(_warnings(fit.poles.size, misfit, passages, unsure)),
     )  # fmt: skip
 
 
@@ -213,9 +220,13 @@ def _inverse(damping: EstimatedNumber) -> EstimatedNumber:
     return EstimatedNumber.of(0.5 / damping.value, 0.5 * damping.sd / damping.value**2)
 
 
-def _warnings(modes: int, misfit: float, passages: Sequence[Passage]) -> list[str]:
+def _warnings(modes: int, misfit: float, passages: Sequence[Passage], unsure: Sequence[Resonance]) -> list[str]:
     """Return what is doubtful of a fit."""
-    warnings = []
+    warnings = [
+        f"something narrow stands at {x.frequency.value / (2.0 * np.pi):.4g} Hz, whose damping the passage does not "
+        "show: hum, or a mode that was passed too fast. It is left out; run through it more slowly"
+        for x in unsure
+    ]
     if misfit > _MISFIT:
         warnings.append(
             f"{modes} modes leave {misfit:.3g} times the noise of the synchronous response; the intervals "

@@ -18,10 +18,11 @@ from ambid.errors import EstimationError
 
 _CHUNK = 200_000  # samples that are worked on at once
 _PER_COLUMN = 2.0  # samples of a block for each column of its regression, at least
-_CHANGES = 0.25  # of the speed within a block, relative, at most: the first turns from rest are left out
+_CHANGES = 0.4  # of the speed from quarter to quarter of a block, at most: the first turns from rest are left out
 _LEAST = 8  # blocks
 _TURNS_BACK = 0.1  # of the highest speed, by which a run-up becomes a coast-down
-_AROUND = 15  # blocks on either side that show the noise
+_AROUND, _FEW = 15, 4  # blocks on either side that show the noise, at most and at least
+_ALIKE = 0.25  # of the speed, within which the noise is the same
 _TOP = 0.45  # of the rate, up to which an order is tracked
 _DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)  # what is smooth over five blocks drops out
 
@@ -95,7 +96,7 @@ def track_orders(
     amplitude = solved[:, at] + 1j * solved[:, at + 1]
     return Orders(
         first=first, stop=stop, time_s=time, speed=speed,
-        acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude, sd=_scatter(amplitude, length),
+        acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude, sd=_scatter(amplitude, length, speed),
         mean=solved[:, 0], rate_hz=rate_hz,
     )  # fmt: skip
 
@@ -108,12 +109,10 @@ def _blocks(angle: Array, turns: int, columns: int) -> tuple[NDArray[np.int64], 
         turned = np.maximum.accumulate(turned)  # an encoder may jitter
     edges = np.searchsorted(turned, 2.0 * np.pi * turns * np.arange(count + 1)).astype(np.int64)
     first, stop = edges[:-1], edges[1:]
-    middle = (first + stop) // 2
-    before, after = turned[middle] - turned[first], turned[np.minimum(stop, turned.size - 1)] - turned[middle]
-    even = np.abs(
-        after / np.maximum(middle - first, 1) / (np.maximum(before, 1e-300) / np.maximum(stop - middle, 1)) - 1
-    )
-    good = (stop - first >= _PER_COLUMN * columns) & (even < _CHANGES)
+    quarters = first[:, None] + (stop - first)[:, None] * np.arange(5) // 4
+    speeds = np.diff(turned[np.minimum(quarters, turned.size - 1)], axis=1)
+    even = np.ptp(speeds, axis=1) < _CHANGES * speeds.mean(axis=1)
+    good = (stop - first >= _PER_COLUMN * columns) & even
     if np.count_nonzero(good) < _LEAST:
         raise EstimationError(
             f"the rotor makes {turned[-1] / (2.0 * np.pi):.4g} turns in this record, of which {np.count_nonzero(good)} "
@@ -157,17 +156,30 @@ def _solved(y: Array, angle: Array, first: NDArray[np.int64], stop: NDArray[np.i
     return np.asarray(np.linalg.solve(gram, right))
 
 
-def _scatter(amplitude: Complex, length: NDArray[np.int64]) -> Array:
+def _scatter(amplitude: Complex, length: NDArray[np.int64], speed: Array) -> Array:
     """Return the standard deviation of real and imaginary part by the fourth difference of five blocks: of its power
     for one sample the median over blocks around, in which what changes smoothly, or in a narrow resonance, is no noise.
     """
     n, share = amplitude.shape[0], np.sqrt(length)[:, None, None]
     power = sum(c * (amplitude * share)[k : n - 4 + k] for k, c in enumerate(_DIFFERENCE))
     size = np.pad(np.abs(power) ** 2, ((2, 2), (0, 0), (0, 0)), mode="edge")
-    reach = min(_AROUND, n - 1)
-    wide = np.pad(size, ((reach, reach), (0, 0), (0, 0)), mode="reflect")
-    window = np.lib.stride_tricks.sliding_window_view(wide, 2 * reach + 1, axis=0)
-    return np.asarray(np.sqrt(np.median(window, axis=-1) / (2.0 * np.log(2.0))) / share)
+    middle = np.array([np.median(size[a:b], axis=0) for a, b in blocks_around(speed, _AROUND)])
+    return np.asarray(np.sqrt(middle / (2.0 * np.log(2.0))) / share)
+
+
+def blocks_around(speed: Array, most: int) -> list[tuple[int, int]]:
+    """Return the blocks around each that show its noise: at most so many on either side, at nearly its speed, at which
+    alone the noise of a loop is the same.
+    """
+    n, around = speed.size, []
+    for k in range(n):
+        near = np.abs(speed[max(0, k - most) : k + most + 1] - speed[k]) < _ALIKE * speed[k]
+        at = k - max(0, k - most)
+        low = at - int(np.argmin(near[at::-1])) + 1 if not near[: at + 1].all() else 0
+        high = at + int(np.argmin(near[at:])) if not near[at:].all() else near.size
+        first = max(0, k - most)
+        around.append((max(0, min(first + low, k - _FEW)), min(n, max(first + high, k + _FEW + 1))))
+    return around
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
