@@ -43,34 +43,34 @@ def passed(w, alpha, s):
 
 
 @functools.cache
-def clean(seconds, low, high):
+def clean(seconds, low, high, modes=2):
     """Return angle, speed and the motion x + jy of a plane that runs through its poles, forward."""
     n = round(seconds * RATE)
     alpha = (high - low) / seconds
     w = low + alpha * np.arange(n) / RATE
     angle = low * np.arange(n) / RATE + 0.5 * alpha * (np.arange(n) / RATE) ** 2
     scale = np.exp(1j * (angle - np.cumsum(w) / RATE))  # the sum of the speeds is not quite the angle
-    z = sum(c * passed(w, alpha, s) for c, s in zip(SHARES, POLES, strict=True))
+    z = sum(c * passed(w, alpha, s) for c, s in list(zip(SHARES, POLES, strict=True))[:modes])
     return angle, w, z * scale
 
 
-def noisy(seconds, low, high, seed, noise=4e-7):
+def noisy(seconds, low, high, seed, noise=4e-7, modes=2):
     """Return the record of a plane."""
-    angle, w, z = clean(seconds, low, high)
+    angle, w, z = clean(seconds, low, high, modes)
     dirty = np.random.default_rng(seed).standard_normal((2, w.size)) * noise
     names = ("ax_position", z.real + dirty[0], "m"), ("ay_position", z.imag + dirty[1], "m"), ("angle", angle, "rad")
     return Record(rate_hz=RATE, channels=tuple(Channel(name=n, unit=u, values=x) for n, x, u in names))
 
 
-def steady_truth():
+def steady_truth(modes=2):
     """Return the peak of the response at constant speed near the first pole."""
     w = np.linspace(400.0, 900.0, 20_001)
-    size = np.abs(sum(c * w**2 / (1j * w - s) for c, s in zip(SHARES, POLES, strict=True)))
+    size = np.abs(sum(c * w**2 / (1j * w - s) for c, s in list(zip(SHARES, POLES, strict=True))[:modes]))
     return max(peaks(w, size), key=lambda p: p.size)
 
 
-def one(seconds, low, high, seed):
-    fit = resonances([track_passage(noisy(seconds, low, high, seed), PLANE)])
+def one(seconds, low, high, seed, modes=2):
+    fit = resonances([track_passage(noisy(seconds, low, high, seed, modes=modes), PLANE)])
     return fit, next(r for r in fit.resonances if not r.critically_damped)
 
 
@@ -95,7 +95,7 @@ def test_whirl_and_orbit_follow_the_sense_in_which_the_rotor_turns():
 def test_a_run_up_and_a_coast_down_show_the_resonance_of_constant_speed():
     truth = steady_truth()
     for low, high, way in ((50.0, 1200.0, 1.0), (1200.0, 50.0, -1.0)):
-        fit, r = one(4.0, low, high, 1)
+        fit, r = one(3.0, low, high, 1)
         assert r.speed.value == pytest.approx(truth.speed, abs=4.0 * r.speed.sd)
         assert r.amplification.value == pytest.approx(truth.amplification, abs=4.0 * r.amplification.sd)
         assert r.frequency.value == pytest.approx(abs(POLES[0]), abs=4.0 * r.frequency.sd)
@@ -108,16 +108,15 @@ def test_a_run_up_and_a_coast_down_show_the_resonance_of_constant_speed():
 
 @long
 def test_intervals_of_resonances_cover():
-    truth, n, hits = steady_truth(), runs(200, short=20), np.zeros(4)
+    truth, n, hits = steady_truth(modes=1), runs(200, short=20), np.zeros(4)
     for seed in range(n):
-        _, r = one(4.0, 50.0, 1200.0, seed)
+        _, r = one(4.0, 50.0, 1200.0, seed, modes=1)
         pairs = (
             (r.speed, truth.speed), (r.amplification, truth.amplification), (r.frequency, abs(POLES[0])),
             (r.damping, -POLES[0].real / abs(POLES[0])),
         )  # fmt: skip
         hits += [x.ci95[0] <= true <= x.ci95[1] for x, true in pairs]
-    assert np.all(hits / n >= 0.88)  # a damped mode beside it, too weak to be told, moves each by half its sd
-    assert np.all(hits / n <= n.limit(0.995))
+    assert np.all((hits / n >= n.limit(0.904)) & (hits / n <= n.limit(0.996)))
 
 
 def steady(bench, speeds):
@@ -164,7 +163,7 @@ def run_of(name, seconds, rpm, runout=True):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "rpm"), [(6.0, (0, 20_000)), pytest.param(12.0, (20_000, 0), marks=long)], ids=["up", "down"]
+    ("seconds", "rpm"), [(4.0, (0, 20_000)), pytest.param(12.0, (20_000, 0), marks=long)], ids=["up", "down"]
 )
 def test_a_run_of_utrc_shows_the_critical_speed_of_its_closed_loop(seconds, rpm):
     bench = bench_of("utrc")
@@ -195,11 +194,12 @@ def test_a_fast_run_through_a_slightly_damped_mode_shows_it_as_at_constant_speed
 
 def test_a_rigid_spindle_has_no_critical_speed():
     bench = bench_of("spindle")
-    passage = track_passage(run_of("spindle", 4.0, (0, 20_000)), bench.model)
-    assert all(r.critically_damped for r in resonances([passage]).resonances)
+    passage = track_passage(run_of("spindle", 2.0, (0, 20_000)), bench.model)
+    assert all(r.critically_damped and not r.amplification.identifiable for r in resonances([passage]).resonances)
     assert [name for name, _, _ in passage.planes] == ["A", "B"]
 
 
+@long
 def test_ways_of_one_record_and_pulses_in_place_of_the_angle_show_the_same():
     angle, w, z = (
         np.concatenate([x, y]) for x, y in zip(clean(4.0, 50.0, 1200.0), clean(4.0, 1200.0, 50.0), strict=True)

@@ -28,9 +28,11 @@ from ambid.signals.orders import blocks_around
 _SERIES = 2e-3  # |W'|/|D|² up to which a series replaces the Faddeeva function
 _GAUSS = ((-0.7745966692414834, 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.7745966692414834, 5.0 / 18.0))
 _BEYOND = 4  # derivatives of exp(j angle), from none on
-_DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)  # ratios that are tried
+_DAMPINGS = np.array([0.003, 0.01, 0.03, 0.1, 0.2, 0.4])  # ratios that are tried
 _TRIED = 80  # frequencies that are tried
 _REACH = 1.3  # of the highest speed, up to which poles are sought
+_THIN = 800  # blocks that a trial looks at, and twice as many at most
+_RIDGE = 1e-9  # of the columns of a pole that is tried
 _STEPS = 40
 _STILL = 1e-9  # relative change of the sum of squares
 _MOVES = 0.15  # prior standard deviation of c
@@ -39,8 +41,8 @@ _AROUND = 30  # blocks on either side that show the noise
 _RANK = 1e-10  # of the largest singular value of the columns
 
 
-def answers(s: complex, speed: Array, acceleration: Array) -> tuple[Complex, Complex, Complex]:
-    """Return b, its derivative by s, and that by the logarithm of the acceleration, (n,)."""
+def answers(s: complex | Complex, speed: Array, acceleration: Array) -> tuple[Complex, Complex, Complex]:
+    """Return b, its derivative by s, and that by the logarithm of the acceleration, (n,), or of several s (m, n)."""
     D = 1j * speed - s
     small = np.abs(acceleration) <= _SERIES * np.abs(D) ** 2
     b, slope, bend = 1.0 / D, 1.0 / D**2, 2.0 / D**3
@@ -53,10 +55,11 @@ def answers(s: complex, speed: Array, acceleration: Array) -> tuple[Complex, Com
         from scipy.special import wofz
 
         fast = ~small
-        q = np.sqrt(-0.5j * acceleration[fast])
+        steady = np.broadcast_to(acceleration, D.shape)[fast]
+        q = np.sqrt(-0.5j * steady)
         b[fast] = 0.5 * np.sqrt(np.pi) / q * wofz(0.5j * D[fast] / q)
-        slope[fast] = (D[fast] * b[fast] - 1.0) / (1j * acceleration[fast])
-        bend[fast] = (D[fast] * slope[fast] - b[fast]) / (1j * acceleration[fast])
+        slope[fast] = (D[fast] * b[fast] - 1.0) / (1j * steady)
+        bend[fast] = (D[fast] * slope[fast] - b[fast]) / (1j * steady)
     return b.astype(np.complex128), slope.astype(np.complex128), 0.5j * acceleration * bend
 
 
@@ -144,6 +147,11 @@ class ModalFit:
         size = np.linalg.norm(self.J, axis=0)
         inverse = np.linalg.pinv((self.J / size).T @ (self.J / size), rcond=1e-12, hermitian=True)
         return np.asarray(inverse / np.outer(size, size) * max(self.misfit, 1.0))
+
+    def blocks(self, r: int) -> float:
+        """Return in how many blocks of a passage a pole stands out, at most."""
+        power = [np.abs(c.pole(complex(self.poles[r]), float(self.moving[r]))[0]) ** 2 for c in self.courses]
+        return max(float(p.sum() ** 2 / (p**2).sum()) for p in power)
 
     def columns(self, poles: Complex, speed: Array) -> Complex:
         """Return the columns of the response at constant speeds, (n, n_columns)."""
@@ -270,24 +278,25 @@ def with_another(fit: ModalFit) -> ModalFit:
     """Return the fit with one more pole, from where on a grid it explains most, roughly: in the middle of the blocks,
     the roles weighted alike.
     """
-    best, prepared = (0.0, 0j), []
+    prepared = []
     for c, own in zip(fit.courses, fit.weights, strict=True):
-        basis = _basis(c, fit.poles, fit.moving, fit.top)[0]
+        some = slice(None, None, 1 + c.speed.size // _THIN)
+        basis = _basis(c, fit.poles, fit.moving, fit.top)[0][some]
         level = np.median(c.sd, axis=0)
-        weight = (level / c.sd).mean(axis=1)[:, None]
+        weight = (level / c.sd[some]).mean(axis=1)[:, None]
         scaled = basis * weight
         Q = np.linalg.qr(scaled / np.linalg.norm(scaled, axis=0))[0]
-        prepared.append((c, weight, Q, (c.amplitude - basis @ own) * weight / level))
-    low = min(float(c.speed.min()) for c in fit.courses)
-    for omega in np.linspace(low, _REACH * fit.top, _TRIED):
-        for zeta in _DAMPINGS:
-            s, gain = complex(-zeta * omega, omega * np.sqrt(1.0 - zeta**2)), 0.0
-            for c, weight, Q, left in prepared:
-                pair = (answers(x, c.speed, c.acceleration)[0] for x in (s, s.conjugate()))
-                new = np.column_stack(list(pair)) * weight
-                new -= Q @ (Q.conj().T @ new)
-                q = np.linalg.qr(new / np.linalg.norm(new, axis=0))[0]
-                gain += float(np.sum(np.abs(q.conj().T @ left) ** 2))
-            if gain > best[0]:
-                best = gain, s
-    return fitted(fit.courses, np.append(fit.poles, best[1]), np.append(fit.moving, 1.0))
+        left = (c.amplitude[some] - basis @ own) * weight / level
+        prepared.append((c.speed[some], c.acceleration[some], weight, Q, left))
+    omega, zeta = np.linspace(min(float(c.speed.min()) for c in fit.courses), _REACH * fit.top, _TRIED), _DAMPINGS
+    tried = np.outer(omega, -zeta + 1j * np.sqrt(1.0 - zeta**2)).ravel()
+    gain = np.zeros(tried.size)
+    for speed, acceleration, weight, Q, left in prepared:
+        pair = [answers(x[:, None], speed, acceleration)[0] for x in (tried, tried.conj())]
+        new = np.stack(pair, axis=-1) * weight
+        new -= Q @ (Q.conj().T @ new)
+        new /= np.linalg.norm(new, axis=1, keepdims=True)
+        along = new.conj().transpose(0, 2, 1)
+        own, both = along @ left, along @ new + _RIDGE * np.eye(2)
+        gain += np.einsum("gck,gck->g", own.conj(), np.linalg.solve(both, own)).real
+    return fitted(fit.courses, np.append(fit.poles, tried[int(np.argmax(gain))]), np.append(fit.moving, 1.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,8 @@ _BULGE = 1.05  # of a parabola over its highest point
 _MODES = 8  # at most
 _SMOOTH, _WORTH = 0.1, 3.0  # damping ratio above which a mode may gain less, for each of its numbers
 _BLOCKS = 24  # that a passage needs, for two modes
+_SEEN, _DAMPED = 0.25, 0.2  # relative spread of a damping ratio that is taken; ratio of a well damped mode
+_RESOLVED = 5.0  # blocks in which a mode has to stand out
 _GRID = 600  # speeds
 _DRAWS = 100  # of the response, for intervals
 _NEAR, _WIDTHS = 0.03, 1.5  # of the frequency, and damping ratios, within which a peak belongs to a pole
@@ -88,7 +90,8 @@ class Resonance:
     """A mode of the loop that a run-up or a coast-down passes.
 
     Speed and amplification are those of the response to unbalance at constant speed: what acceleration shifts and
-    broadens is taken out. Intervals hold noise alone.
+    broadens is taken out. Intervals hold noise alone. Numbers of a well damped mode without half-power points are not
+    identifiable: they lean on what is fitted beside it.
     """
 
     speed: EstimatedNumber  # critical speed, rad/s: where that response peaks; of a damped mode its natural frequency
@@ -147,7 +150,7 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     for r in np.argsort(np.abs(fit.poles)):
         if low <= np.abs(fit.poles[r]) <= high:
             one = _resonance(fit, int(r), passage, first, speed, response, draws, least)
-            if one.damping.identifiable:
+            if one.damping.sd < _SEEN * one.damping.value and fit.blocks(int(r)) > _RESOLVED:
                 modal.append(one)
             elif one.damping.value < _SMOOTH:
                 unsure.append(one)
@@ -202,6 +205,8 @@ def _resonance(
         factors = [p.amplification for p in others if p is not None and p.amplification is not None]
         if peak.amplification is not None and len(factors) > 0.9 * len(draws):
             factor, by_points = EstimatedNumber.of(peak.amplification, float(np.std(factors))), True
+    if not by_points and damping.value > _DAMPED:
+        at, factor, frequency, damping = (replace(v, identifiable=False) for v in (at, factor, frequency, damping))
     x, y = (np.array([residues[p[k]] for p in passage.planes]) for k in (1, 2))
     y = -y if passage.reverse else y
     forward, backward = float(np.sum(np.abs(x + 1j * y) ** 2)), float(np.sum(np.abs(x - 1j * y) ** 2))
