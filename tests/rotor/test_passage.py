@@ -244,6 +244,10 @@ def test_displacements_count_from_the_centre_with_the_offset():
     assert at.largest == size.max() > 5e-5
     assert at.offset == pytest.approx((4e-5, -3e-5), abs=1e-8)
     assert at.vibration == pytest.approx(np.hypot(x.values, y.values).max(), rel=0.01)
+    thrust = RotorModel(bearings=(Bearing(name="T", axes=("ax",), axial=True),))
+    low = dataclasses.replace(x, values=x.values - 4e-5)
+    (along,) = displacements(dataclasses.replace(record, channels=(low,)), thrust)
+    assert along.largest == np.abs(low.values).max()
 
 
 def number(value, sd=0.0):

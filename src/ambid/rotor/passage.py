@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -112,14 +112,8 @@ class Passage:
     @property
     def planes(self) -> tuple[tuple[str, int, int], ...]:
         """Name of each plane of sensors with two axes, such as "A" or "A 2", and the places of x and y in `roles`."""
-        planes: list[tuple[str, int, int]] = []
-        for b in self.model.bearings:
-            for k in range(len(b.z_sensors)):
-                pair = [position_role(axis, k) for axis in b.axes]
-                if len(pair) == 2 and set(pair) <= set(self.roles):
-                    x, y = (self.roles.index(role) for role in pair)
-                    planes.append((b.name if k == 0 else f"{b.name} {k + 1}", x, y))
-        return tuple(planes)
+        pairs = [(name, roles) for name, roles in sensor_planes(self.model, self.roles) if len(roles) == 2]
+        return tuple((name, self.roles.index(x), self.roles.index(y)) for name, (x, y) in pairs)
 
     def whirl(self, plane: str) -> Whirl:
         """Return the whirl of a plane of `planes` over the speed."""
@@ -148,6 +142,18 @@ def whirl_of(amplitude: Complex, sd: Array, *, reverse: bool = False) -> Whirl:
     x, y = amplitude[:, 0], -amplitude[:, 1] if reverse else amplitude[:, 1]
     backward = np.conj(0.5 * (x - 1j * y)).astype(np.complex128)
     return Whirl(forward=0.5 * (x + 1j * y), backward=backward, sd=0.5 * np.sqrt((sd**2).sum(axis=1)))
+
+
+def sensor_planes(model: RotorModel, known: Container[str]) -> list[tuple[str, tuple[str, ...]]]:
+    """Return each plane of sensors, "A", of a second one "A 2", with those of its positions that are known: x and y, or
+    one.
+    """
+    planes = []
+    for b in model.bearings:
+        for k in range(len(b.z_sensors)):
+            roles = tuple(role for role in (position_role(axis, k) for axis in b.axes) if role in known)
+            planes.append((b.name if k == 0 else f"{b.name} {k + 1}", roles))
+    return [(name, roles) for name, roles in planes if roles]
 
 
 def positions_of(record: Record, model: RotorModel) -> tuple[str, ...]:
@@ -195,7 +201,7 @@ class Displacement:
     peak, with the offset at rest.
     """
 
-    plane: str  # as `Passage.planes`; of a single axis its name
+    plane: str  # as `sensor_planes`
     largest: float  # of √(x² + y²), m
     at_s: float
     offset: tuple[float, ...]  # mean of each axis from the centre, m
@@ -207,19 +213,14 @@ def displacements(record: Record, model: RotorModel, centre: float = 0.0) -> tup
     clearance, m.
     """
     every: list[Displacement] = []
-    for b in model.bearings:
-        for k in range(len(b.z_sensors)):
-            axes = [position_role(axis, k) for axis in b.axes if position_role(axis, k) in record]
-            if not axes:
-                continue
-            y = np.column_stack([record[role].values for role in axes]) - centre
-            size, mean = np.hypot.reduce(y, axis=1), y.mean(axis=0)
-            at = int(np.argmax(size))
-            every.append(
-                Displacement(
-                    plane=b.name if k == 0 else f"{b.name} {k + 1}", largest=float(size[at]),
-                    at_s=at / record.rate_hz, offset=tuple(mean.tolist()),
-                    vibration=float(np.hypot.reduce(y - mean, axis=1).max()),
-                )
-            )  # fmt: skip
+    for plane, roles in sensor_planes(model, record):
+        y = np.column_stack([record[role].values for role in roles]) - centre
+        size, mean = np.linalg.norm(y, axis=1), y.mean(axis=0)
+        at = int(np.argmax(size))
+        every.append(
+            Displacement(
+                plane=plane, largest=float(size[at]), at_s=at / record.rate_hz, offset=tuple(mean.tolist()),
+                vibration=float(np.linalg.norm(y - mean, axis=1).max()),
+            )
+        )  # fmt: skip
     return tuple(every)

@@ -1,25 +1,28 @@
 """Points of a measured Campbell diagram: modes of the loop that noise excites in records at constant speed, forward and
 backward, by the spectrum of x + jy without its synchronous part and without what an excitation repeats.
 
-Around a pole the spectrum is B (1 + (A s² + C s u)/(u² + s²)), u = w - w_0: the second part where sensors are noisy, to
+Around a pole the spectrum is B exp(D u) (1 + (A s² + C s u)/(u² + s²)), u = w - w_0: C where sensors are noisy, to
 which the loop reacts. It is fitted by Whittle's likelihood.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.modes import EstimatedNumber
-from ambid.physics.rotor_model import RotorModel, position_role
+from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
-from ambid.rotor.synchronous import aperiodic, separate
+from ambid.rotor.passage import sensor_planes
+from ambid.rotor.synchronous import Separated, aperiodic, separate
 
-_SEGMENTS = 16  # of the averaged spectrum in which peaks are sought
-_STANDS_OUT = 2.0  # over the median around
-_AROUND = 0.15  # of the frequency on either side, for that median
+_SEGMENTS = 16  # at least, of the averaged spectrum in which peaks are sought
+_STANDS_OUT = 2.0  # over the median of a band
+_FIRST, _BANDS = 8, 50  # bin; bands of equal ratio from there on, for that median
+_LONGEST_S = 2.0  # of a segment
 _TAPER = 0.1  # of the record at both ends
 _WIDTHS = 8.0  # half widths on either side that are fitted
 _BINS = 30  # at least
@@ -42,14 +45,14 @@ class WhirlPoint:
     plane: str  # of sensors, or the axis
 
 
-def whirl_points(record: Record, model: RotorModel) -> tuple[WhirlPoint, ...]:
+def whirl_points(record: Record, model: RotorModel, apart: Separated | None = None) -> tuple[WhirlPoint, ...]:
     """Return the modes that noise shows in a record at constant speed, by frequency; modes with a damping ratio above
-    0.2 make no peak, and are not sought.
+    0.2 make no peak, and are not sought. `apart`: the record without its synchronous part, where it is at hand.
     """
-    apart = separate(record, model)
+    apart = apart or separate(record, model)
     clean, excitation, speed = apart.record, apart.excitation, apart.speed
     points: list[WhirlPoint] = []
-    for name, roles in _planes(model, record):
+    for name, roles in sensor_planes(model, record):
         y = np.column_stack([clean[role].values for role in roles])
         if excitation is not None:
             y = y[excitation.first : excitation.first + excitation.period * excitation.count]
@@ -69,24 +72,13 @@ def whirl_points(record: Record, model: RotorModel) -> tuple[WhirlPoint, ...]:
     return tuple(sorted(kept, key=lambda p: p.frequency.value))
 
 
-def _planes(model: RotorModel, record: Record) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the positions of each plane of sensors, x and y or one."""
-    planes = []
-    for b in model.bearings:
-        for k in range(len(b.z_sensors)):
-            roles = tuple(position_role(axis, k) for axis in b.axes if position_role(axis, k) in record)
-            if roles:
-                planes.append((b.name if k == 0 else f"{b.name} {k + 1}", roles))
-    return planes
-
-
 def _of_motion(motion: Complex, rate_hz: float, speed: float, plane: str, *, two: bool) -> list[WhirlPoint]:
     """Return the peaks of one motion."""
     n, points = motion.size, []
     taper = _tukey(n)
     power = np.abs(np.fft.fft(motion * taper)) ** 2 / float(taper @ taper)
     inflation = n * float(np.sum(taper**4)) / float(taper @ taper) ** 2
-    smooth, size = _averaged(motion)
+    smooth, size = _averaged(motion, rate_hz)
     bins = 2.0 * np.pi * rate_hz / n
     for direction in (1, -1) if two else (0,):
         way = -1 if direction * np.sign(speed or 1.0) < 0 else 1
@@ -117,22 +109,24 @@ def _tukey(n: int) -> Array:
     return np.concatenate([rise, np.ones(n - 2 * edge), rise[::-1]])
 
 
-def _averaged(motion: Complex) -> tuple[Array, int]:
+def _averaged(motion: Complex, rate_hz: float) -> tuple[Array, int]:
     """Return the spectrum averaged over overlapping segments, (size,), and its size."""
-    size = 2 * motion.size // (_SEGMENTS + 1) // 2 * 2
+    size = min(2 * motion.size // (_SEGMENTS + 1), round(_LONGEST_S * rate_hz)) // 2 * 2
     window = np.hanning(size + 1)[:-1]
     starts = range(0, motion.size - size + 1, size // 2)
     return np.mean([np.abs(np.fft.fft(motion[a : a + size] * window)) ** 2 for a in starts], axis=0), size
 
 
 def _tops(side: Array, size: int) -> list[tuple[int, float]]:
-    """Return the bins that stand out, with half their width."""
+    """Return the bins that stand out of the median of their band, with half their width."""
+    n = int(_TOP * size)
+    edges = np.unique(np.geomspace(_FIRST, n, _BANDS).round().astype(int))
+    level = [np.median(side[a:b]) for a, b in pairwise(edges)]
+    ground = np.interp(np.arange(n), 0.5 * (edges[1:] + edges[:-1]), level)
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(side, 3, mode="edge"), 7).max(axis=1)[:n]
+    top = np.flatnonzero((side[:n] == near) & (side[:n] > _STANDS_OUT * ground))
     tops = []
-    for k in range(8, int(_TOP * size)):
-        reach = max(12, int(_AROUND * k))
-        near = side[max(1, k - 3) : k + 4]
-        if side[k] < near.max() or side[k] < _STANDS_OUT * float(np.median(side[max(1, k - reach) : k + reach])):
-            continue
+    for k in top[top >= _FIRST].tolist():
         below = np.flatnonzero(side[k:] < 0.5 * side[k])
         tops.append((k, max(1.0, float(below[0]) if below.size else 1.0)))
     return tops
@@ -147,7 +141,7 @@ def _lorentzian(power: Array, at: float, half: float) -> tuple[Array, Array] | N
         return None
     level = float(np.median(seen)) / np.log(2.0)
     height = max(float(np.mean(seen[np.abs(x - at) <= half + 1.0])) / level, 2.0)
-    p = np.array([at, np.log(half), height, 0.0, np.log(level)])
+    p, width = np.array([at, np.log(half), height, 0.0, np.log(level), 0.0]), float(reach)
 
     def spectrum(p: Array) -> tuple[Array, Array]:
         """Return the spectrum and its logarithmic derivatives."""
@@ -156,7 +150,9 @@ def _lorentzian(power: Array, at: float, half: float) -> tuple[Array, Array] | N
         S = 1.0 + (p[2] * s**2 + p[3] * s * u) / size
         by_u = p[3] * s / size - 2.0 * u * (p[2] * s**2 + p[3] * s * u) / size**2
         by_s = (2.0 * p[2] * s**2 + p[3] * s * u) / size - 2.0 * s**2 * (p[2] * s**2 + p[3] * s * u) / size**2
-        return np.exp(p[4]) * S, np.array([-by_u / S, by_s / S, s**2 / size / S, s * u / size / S, np.ones(x.size)])
+        slope = (x - at) / width
+        rows = [-by_u / S, by_s / S, s**2 / size / S, s * u / size / S, np.ones(x.size), slope]
+        return np.exp(p[4] + p[5] * slope) * S, np.array(rows)
 
     def likelihood(p: Array) -> float:
         S = spectrum(p)[0]
@@ -167,7 +163,7 @@ def _lorentzian(power: Array, at: float, half: float) -> tuple[Array, Array] | N
         S, rows = spectrum(p)
         F = rows @ rows.T
         step = np.linalg.solve(F + 1e-9 * np.diag(np.diag(F)), rows @ (seen / S - 1.0))
-        room = np.array([half, 1.0, 1.0 + abs(p[2]), 1.0 + abs(p[2]), 1.0])
+        room = np.array([half, 1.0, 1.0 + abs(p[2]), 1.0 + abs(p[2]), 1.0, 1.0])
         step *= min(1.0, 1.0 / max(float((np.abs(step) / room).max()), 1e-300))
         while likelihood(p + step) < present and np.abs(step).max() > 1e-9:
             step *= 0.5
