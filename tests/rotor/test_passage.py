@@ -302,5 +302,6 @@ def test_noise_shows_the_bending_modes_at_constant_speed():
     for p in second:
         near = s[np.argmin(np.abs(s.imag - p.frequency.value))]
         assert p.frequency.value == pytest.approx(near.imag, abs=4.0 * p.frequency.sd)
-        assert p.damping.value == pytest.approx(-near.real / abs(near), abs=4.0 * p.damping.sd)
+        assert p.frequency.sd < 5e-3 * near.imag
+        assert not p.damping.identifiable  # eight seconds are too short for that
         assert p.speed * RPM == pytest.approx(15_000.0, rel=1e-3)

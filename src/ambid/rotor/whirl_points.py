@@ -31,6 +31,8 @@ _GAIN = 20.0  # logarithm of the likelihood over that of a level alone
 _TONE = 2.0  # bins: a peak that is not wider is a line, no mode
 _DAMPED = 0.2  # damping ratio up to which a peak is that of a mode
 _SAME = 0.01  # of the frequency, within which two planes show one mode
+_SEEN = 0.5  # relative spread of a damping ratio, up to which a peak is taken
+_SURE = 0.15  # relative spread up to which a damping ratio is identifiable
 _TOP = 0.35  # of the rate
 
 
@@ -40,7 +42,7 @@ class WhirlPoint:
 
     speed: float  # rad/s
     frequency: EstimatedNumber  # damped, rad/s
-    damping: EstimatedNumber  # ratio
+    damping: EstimatedNumber  # ratio; a peak that hardly stands out looks too narrow: then it is not identifiable
     direction: int  # 1 forward, -1 backward, 0 of one axis alone
     plane: str  # of sensors, or the axis
 
@@ -96,10 +98,11 @@ def _of_motion(motion: Complex, rate_hz: float, speed: float, plane: str, *, two
                 points.append(
                     WhirlPoint(
                         speed=abs(speed), frequency=EstimatedNumber.of(w, float(sd[0])),
-                        damping=EstimatedNumber.of(float(ratio), float(sd[1] / w)), direction=direction, plane=plane,
+                        damping=EstimatedNumber.of(float(ratio), float(sd[1] / w), visible=sd[1] < _SURE * s),
+                        direction=direction, plane=plane,
                     )
                 )  # fmt: skip
-    return [p for p in points if p.frequency.identifiable and p.damping.identifiable]
+    return [p for p in points if p.frequency.sd < _SAME * p.frequency.value and p.damping.sd < _SEEN * p.damping.value]
 
 
 def _tukey(n: int) -> Array:
