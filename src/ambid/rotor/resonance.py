@@ -193,9 +193,11 @@ def _resonance(
     plane = max(part, key=lambda name: float(part[name][0]))
     wide = max(_NEAR, _WIDTHS * damping.value) * size
 
+    def close(curve: Array, x: Array) -> list[Peak]:
+        return sorted((p for p in peaks(x, curve) if abs(p.speed - size) < wide), key=lambda p: abs(p.speed - size))
+
     def near(curve: Array, x: Array) -> Peak | None:
-        close = [p for p in peaks(x, curve) if abs(p.speed - size) < wide]
-        return min(close, key=lambda p: abs(p.speed - size), default=None)
+        return next(iter(close(curve, x)), None)
 
     peak = near(_majors(passage, response)[plane], speed)
     others = [near(_majors(passage, y)[plane], speed) for y in draws]
@@ -211,12 +213,13 @@ def _resonance(
     y = -y if passage.reverse else y
     forward, backward = float(np.sum(np.abs(x + 1j * y) ** 2)), float(np.sum(np.abs(x - 1j * y) ** 2))
     largest = residues[int(np.argmax(np.abs(residues)))]
+    passed = close(_majors(passage, passage.amplitude)[plane], passage.speed)  # noise may split its top
     return Resonance(
         speed=at, amplification=factor, half_power=by_points, critically_damped=factor.value < least,
         frequency=frequency, damping=damping, pole=s,
         shape={role: complex(v / largest) for role, v in zip(passage.roles, residues, strict=True)},
         forward=forward / (forward + backward) if passage.planes else None,
-        measured=near(_majors(passage, passage.amplitude)[plane], passage.speed), plane=plane,
+        measured=max(passed, key=lambda p: p.size, default=None), plane=plane,
     )  # fmt: skip
 
 
