@@ -13,7 +13,7 @@ from ambid.physics.presets import preset
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Channel, Record
 from ambid.rig import rig_of_preset
-from ambid.rotor.passage import displacements, track_passage, whirl_of
+from ambid.rotor.passage import changes_speed, displacements, track_passage, whirl_of
 from ambid.rotor.passage_fit import answers
 from ambid.rotor.resonance import Resonance, SeparationRule, peaks, resonances, scaled_to_limit, separations
 from ambid.rotor.whirl_points import whirl_points
@@ -236,6 +236,15 @@ def test_what_cannot_be_tracked_is_refused():
     rolled = passage.rolled(200.0, 500.0)
     within = (rolled.speed >= 200.0) & (rolled.speed <= 500.0)
     assert np.abs(rolled.amplitude[within].mean(axis=0)).max() < 1e-12
+
+
+def test_a_record_is_a_run_up_by_its_turns_and_the_range_of_its_speed():
+    def of(speed):
+        return Record(rate_hz=1000.0, channels=(Channel(name="speed", unit="rad/s", values=speed),))
+
+    assert changes_speed(of(np.linspace(0.0, 500.0, 5000)))
+    assert not changes_speed(of(np.full(5000, 500.0)))
+    assert not changes_speed(of(0.01 * np.random.default_rng(1).standard_normal(5000).cumsum()))
 
 
 def test_displacements_count_from_the_centre_with_the_offset():

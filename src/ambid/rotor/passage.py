@@ -16,6 +16,7 @@ from ambid.rotor.synchronous import Source, angle_of_pulses
 from ambid.signals.orders import Orders, Waterfall, track_orders, waterfall
 
 _ROLLS = 3  # blocks that a slow roll needs
+_TURNS = 64  # that a run-up has; noise of a speed channel at rest makes none
 _RANGE = 0.2  # of the speed over its mean, from which a record is a run-up or a coast-down
 
 
@@ -180,7 +181,8 @@ def changes_speed(record: Record) -> bool:
         return False
     speed = np.abs(turning_of(record).speed(record.rate_hz))
     parts = np.array([x.mean() for x in np.array_split(speed, 20)])
-    return bool(np.ptp(parts) > _RANGE * parts.mean())
+    turns = parts.mean() * record.n_samples / record.rate_hz / (2.0 * np.pi)
+    return bool(turns > _TURNS and np.ptp(parts) > _RANGE * parts.mean())
 
 
 def record_waterfall(
