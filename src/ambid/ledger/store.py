@@ -211,7 +211,7 @@ class Ledger:
         from sqlalchemy import select
 
         t = entry.tables().tables["failure"]
-        queries = [select(t)] if keys is None else [select(t).where(t.c.key.in_(some)) for some in _chunks([*keys])]
+        queries = [select(t)] if keys is None else [select(t).where(t.c.key.in_(some)) for some in chunks([*keys])]
         with self._reading() as c:
             rows = [row for query in queries for row in _mappings(c, query)]
         return {row.key: Failure(**{x: row[x] for x in row if x != "key"}) for row in rows}
