@@ -27,6 +27,7 @@ from ambid.physics.linear_model import LinearModel, model
 from ambid.settings.caller import command, saved
 
 _ROUNDING = 1e-9  # samples
+_EDITED, _ROUNDED = 1e-9, 1e-12  # relative difference, and share of the largest, that rounding does not explain
 _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
 
 
@@ -463,6 +464,15 @@ class Continuous:
         poles = np.linalg.eigvals(at.A).astype(np.complex128)
         return cls(states=plant.states, A=at.A, B=at.B, C=at.C, poles=poles)
 
+    def check_is_of(self, plant: LinearModel, theta: Mapping[str, float]) -> None:
+        """Raise ValueError where this is not the plant of a model with its numbers: one of both was edited."""
+        at = plant.matrices(theta)
+        for name, here, there in (("A", self.A, at.A), ("B", self.B, at.B), ("C", self.C, at.C)):
+            if here.shape != there.shape or not np.allclose(
+                here, there, rtol=_EDITED, atol=_ROUNDED * abs(there).max()
+            ):
+                raise ValueError(f"continuous.{name} does not follow from the parameters: one of both was edited")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoiseModel:
@@ -634,10 +644,9 @@ def _check_consistent(estimate: Estimate) -> None:
     size = len(estimate.covariance_names)
     if set(estimate.covariance_names) - set(specs) or estimate.covariance.shape != (size, size):
         raise ValueError("the covariance is not of the parameters")
-    if estimate.continuous.A.shape != (n, n) or estimate.continuous.C.shape != (n_y, n):
-        raise ValueError("the continuous plant is not of the model's size")
-    if estimate.continuous.B.shape != (n, len(plant.inputs)) or int(str(estimate.record["samples"])) < 1:
-        raise ValueError("the continuous plant or the record is not of the model's size")
+    at.check_is_of(plant, estimate.values)
+    if int(str(estimate.record["samples"])) < 1:
+        raise ValueError("the record has no samples")
     if not float(str(estimate.record["rate_hz"])) > 0 or estimate.status not in ("converged", "stalled"):
         raise ValueError("the record's rate or the status is not that of a finished estimate")
     for delay in (estimate.delay[role] for role in plant.inputs):

@@ -201,6 +201,10 @@ def rotor_estimate_from_json(document: Mapping[str, Any], where: str) -> RotorEs
                 raise ValueError(f"numbers.{spec.name} is missing")
             if spec.positive and not estimate.numbers[spec.name] > 0.0:
                 raise ValueError(f"numbers.{spec.name} is not positive")
+        for p in estimate.parameters:
+            if p.name in estimate.numbers and p.value != estimate.numbers[p.name]:
+                raise ValueError(f"parameters.{p.name} is not numbers.{p.name}")
+        estimate.continuous.check_is_of(estimate.plant, estimate.numbers)
         if any(p.sd < 0 for p in estimate.parameters):
             raise EstimationError("a standard deviation is negative")
         return estimate
