@@ -43,6 +43,21 @@ def test_what_a_record_does_not_show_is_not_exported(made, ambid, monkeypatch):
     assert "NOT TO BE RELIED ON" in str(loadmat(made / "weak.mat")["about"])
 
 
+@pytest.mark.parametrize(("rows", "said"), [(0, "does not follow from the parameters"), (1, "m = -")])
+def test_an_estimate_that_was_edited_is_refused_in_one_line(made, ambid, monkeypatch, rows, said):
+    monkeypatch.chdir(made)
+    document = json.loads((made / "e.json").read_text())
+    document["parameters"]["m"]["value"] *= -1.0
+    if rows:  # the equation of motion too
+        document["continuous"]["A"][1] = [-x for x in document["continuous"]["A"][1]]
+    (made / "edited.json").write_text(json.dumps(document))
+    for ending in ("c", "mat", "fmu", "py"):
+        done = ambid("export", "edited.json", "-o", f"edited.{ending}")
+        assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
+        assert said in done.err
+    assert not list(made.glob("edited.[!j]*"))
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -1,11 +1,13 @@
 """Exported plants as something that is stepped: C source that is compiled, an FMU in FMPy."""
 
 import ctypes
+import runpy
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
 from ambid.job.exchange import write_plant
 
@@ -56,6 +58,8 @@ class InFmpy:
 
         self.told = fmpy.read_model_description(str(path))
         self.at = {v.name: v.valueReference for v in self.told.modelVariables}
+        inputs = (v.name for v in self.told.modelVariables if v.causality == "input")
+        self.driven = [name for name in inputs if not name.startswith("disturbing")]
         self.shown = [v.valueReference for v in self.told.modelVariables if v.causality == "output"]
         self.fmu = FMU2Slave(
             guid=self.told.guid, unzipDirectory=fmpy.extract(str(path), str(folder)), instanceName=name,
@@ -74,11 +78,55 @@ class InFmpy:
     def set(self, **values):
         self.fmu.setReal([self.at[name] for name in values], list(values.values()))
 
-    def step(self, u, length, force=0.0):
-        self.set(voltage=u, disturbing_force=force)
+    def step(self, u, length):
+        self.set(**dict(zip(self.driven, np.atleast_1d(u).tolist(), strict=True)))
         self.fmu.doStep(self.time, length)
         self.time += length
         return 0
 
     def outputs(self):
         return self.fmu.getReal(self.shown)
+
+
+def runs_of_exports(estimate, folder, u, *, anyway=True):
+    """What each export of an estimate makes of the same inputs, (n, n_y) from the operating point."""
+    control = pytest.importorskip("control")
+    period = 1.0 / float((estimate.records[0] if hasattr(estimate, "law") else estimate.record)["rate_hz"])
+    for ending, to in ((".mat", None), (".py", "control"), (".fmu", None)):
+        write_plant(estimate, folder / f"plant{ending}", "plant", to, anyway=anyway)
+    read = loadmat(folder / "plant.mat", simplify_cells=True)["sampled"]
+    script = runpy.run_path(str(folder / "plant.py"))["sampled"]()
+    n_y, n_u = script.noutputs, script.ninputs
+    matrices = (np.asarray(read[x]).reshape(rows, columns) for x, rows, columns in (
+        ("A", script.nstates, script.nstates), ("B", script.nstates, n_u), ("C", n_y, script.nstates)
+    ))  # fmt: skip
+    found = {
+        ".mat": _states(*matrices, u),
+        ".py": control.forced_response(script, inputs=u.T, squeeze=False).outputs.T,
+    }
+    for name, plant in (
+        (".c", InC(estimate, folder, anyway=anyway)),
+        (".fmu", InFmpy(folder / "plant.fmu", folder / "open")),
+    ):
+        rows = []
+        for value in u:
+            rows.append(plant.outputs()[:n_y])
+            assert plant.step(value, period) == 0
+        found[name] = np.array(rows)
+    return found
+
+
+def _states(A, B, C, u):
+    x, rows = np.zeros(A.shape[0]), []
+    for value in u:
+        rows.append(C @ x)
+        x = A @ x + B @ value
+    return np.array(rows)
+
+
+def assert_agree(runs, within=1e-9):
+    """Each output of every export the same, as a share of its range."""
+    wanted = runs[".mat"]
+    assert np.all(np.ptp(wanted, axis=0) > 0.0)
+    for name, y in runs.items():
+        assert np.max(np.abs(y - wanted) / np.ptp(wanted, axis=0)) < within, name

@@ -4,6 +4,7 @@ import re
 import runpy
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +14,17 @@ import ambid
 from ambid.bearing.magnet_problem import UNITS
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Delay, EstimatedParameter
+from ambid.job.exchange import _operating_point
 from ambid.job.plant_source import binaries
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.rig import rig_from_text
 from ambid.rig.draft import preset_text
 from tests.bearing.magnet.estimates import by_hand, seen
-from tests.job.exported import CC, FLAGS, InC, InFmpy, needs_compiler
+from tests.job.exported import CC, FLAGS, InC, InFmpy, assert_agree, needs_compiler, runs_of_exports
+from tests.tiers import sample
+
+PROTOTYPE = Path(ambid.__file__).parent / "data" / "prototype.toml"
 
 
 def rig_text(name):
@@ -82,18 +87,16 @@ def simulated(estimate, seconds=0.05):
 
 
 def in_loop(plant, record, law):
-    """Run a plant in the loop of a simulated record, and return position, current and voltage."""
-    first = {name: float(record[name].values[0]) for name in ("position", "current")}
+    """Run a plant in the loop of a simulated record, which begins at rest; return position, current and voltage."""
     e, z, rows = record["excitation"].values, np.zeros(law.order), []
-    rest = float(record["voltage"].values[0] - e[0])
+    rest = [record["position"].values[0], record["current"].values[0], record["voltage"].values[0] - e[0]]
     for k in range(record.n_samples):
-        position, current = plant.outputs()[:2]
-        seen_by_law = np.array([position - first["position"], current - first["current"]])
-        u = rest + e[k] + float((law.C @ z + law.D @ seen_by_law)[0])
-        z = law.A @ z + law.B @ seen_by_law
-        rows.append((position, current, u))
+        y = np.array(plant.outputs()[:2])
+        u = e[k] + float((law.C @ z + law.D @ y)[0])
+        z = law.A @ z + law.B @ y
+        rows.append((*y, u))
         assert plant.step(u, 1.0 / record.rate_hz) == 0
-    return np.array(rows)
+    return np.array(rows) + rest
 
 
 def assert_the_same(plant, estimate):
@@ -140,10 +143,11 @@ def test_a_rotor_that_falls_stops_and_lies_as_in_the_simulator(axis, ball, tmp_p
             closed=False,
             force=True,
         )
+    rest = _operating_point(estimate)
     plant, told, found = InC(estimate, tmp_path), [], []
     for u in record["voltage"].values:
-        found.append(plant.outputs()[:2])
-        told.append(plant.step(u, 1.0 / record.rate_hz))
+        found.append(np.add(plant.outputs()[:2], (rest["position"], rest["current"])))
+        told.append(plant.step(u - rest["voltage"], 1.0 / record.rate_hz))
     assert (told[0], told[-1]) == (0, 1)
     for j, role in enumerate(("position", "current")):
         wanted = record[role].values
@@ -207,8 +211,10 @@ def test_an_fmu_is_several_plants_that_are_set_kept_and_begun_again(axis, tmp_pa
     one.begin()
     assert run(one) == moved
     two.fmu.reset()
-    two.begin(L=0.5 * axis["L"].value, position_rest=1e-5)
+    two.begin(L=0.5 * axis["L"].value, position_start=1e-5)
     assert two.outputs()[0] == 1e-5
+    two.fmu.reset()
+    two.begin(L=0.5 * axis["L"].value)
     heavier = replace(axis, parameters=tuple(
         replace(p, value=0.5 * p.value) if p.name == "L" else p for p in axis.parameters
     ))  # fmt: skip
@@ -347,10 +353,44 @@ def test_the_other_linear_models_are_stepped_by_their_matrices(tmp_path, model, 
     read = loadmat(tmp_path / "a.mat", simplify_cells=True)["sampled"]
     A, B, C = (np.asarray(read[x]) for x in "ABC")
     A, x = np.atleast_2d(A), np.zeros(np.atleast_2d(A).shape[0])
-    rest = [estimate.operating_point[role] for role in roles]
     for u in np.random.default_rng(1).standard_normal(20):
         found = plant.outputs()[0]
         wanted = (np.atleast_2d(C.reshape(1, -1)) @ x)[0]
-        assert found - rest[1] == pytest.approx(wanted, rel=1e-9, abs=1e-12 * (abs(rest[1]) + abs(wanted)))
-        assert plant.step(u + rest[0], period) == 0
+        assert found == pytest.approx(wanted, rel=1e-9)
+        assert plant.step(u, period) == 0
         x = A @ x + B.reshape(x.size) * u
+
+
+@needs_compiler
+@pytest.mark.parametrize("bench", sample(["thesis", "unstable-bearing", "rmit-axis", "levitated-ball", "prototype"], 1))
+def test_all_exports_of_a_bench_agree(tmp_path, bench):
+    rig = PROTOTYPE if bench == "prototype" else rig_from_text(preset_text(preset(bench)), "rig.toml")
+    found = ambid.identify(ambid.simulate(bench, duration=0.2, seed=1), rig)
+    rest = {**found.operating_point, "voltage": 0.2e-3}
+    late = {"voltage": Delay(samples=1, fraction=0.4, sd=None, how="given")}
+    estimate = replace(found, operating_point=rest, delay=late)
+    n = int(0.02 * float(estimate.record["rate_hz"]))
+    assert_agree(runs_of_exports(estimate, tmp_path, 0.01 * np.random.default_rng(1).standard_normal((n, 1))))
+    for ending in ("mat", "py", "c"):
+        text = (tmp_path / f"plant.{ending}").read_text(encoding="latin-1")
+        assert "count from the operating point: " in text
+        assert all(f"{name} {value!r} " in text for name, value in rest.items())
+    assert loadmat(tmp_path / "plant.mat", simplify_cells=True)["operating_point"] == rest
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["ball", "pair"])
+def test_a_nonlinear_plant_is_its_matrices_where_it_hardly_moves(axis, ball, tmp_path, name):
+    u = 1e-5 * np.random.default_rng(1).standard_normal((40, 1))
+    runs = runs_of_exports(plants(axis, ball)[name], tmp_path, u)
+    assert_agree({".mat": runs[".c"], ".fmu": runs[".fmu"]})
+    assert_agree(runs, within=1e-4)
+
+
+@needs_compiler
+@pytest.mark.parametrize("stem", ["double", "linux", "class", "While"])
+def test_a_keyword_as_a_name_compiles(axis, tmp_path, stem):
+    axis.export(tmp_path / f"{stem}.c")
+    axis.export(tmp_path / f"{stem}.h")
+    subprocess.run([CC, "-Wall", "-Wextra", "-Werror", "-c", f"{stem}.c"], cwd=tmp_path, check=True)
+    assert f"void plant_{stem.lower()}_reset(" in (tmp_path / f"{stem}.h").read_text(encoding="utf-8")

@@ -32,6 +32,7 @@ from ambid.estimation.estimate import (
 )
 from ambid.estimation.result import Linear, Predicting
 from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.nonlinear import IDEAL, PowerStage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -219,15 +220,17 @@ def linearised(
     estimate: NonlinearBearingEstimate, position: float | None = None, current: float | None = None
 ) -> Continuous:
     """Return the plant about a point in m and A, by default the records' operating point: m x'' = f - c x', L i' = V -
-    R i - k_i x', f = k_i i - k_x x (thesis eq. 4.8); an eddy pole adds the state f' = a (k_i i - k_x x - f).
+    R i - k_i x', f = k_i i - k_x x (thesis eq. 4.8); a drop adds its slope to R, an eddy pole the state f' = a (k_i i -
+    k_x x - f).
     """
     x = estimate.operating_point["position"] if position is None else position
     i = estimate.operating_point["current"] if current is None else current
     at, v = estimate.curves(x, i), estimate.values
     k_x, k_i, ell = float(at.k_x.value[0]), float(at.k_i.value[0]), float(at.L.value[0])
-    m, c = v["m"], v["c"]
+    m, c, stage = v["m"], v["c"], PowerStage(v_drop=v.get("v_drop", 0.0), i_drop=v.get("i_drop", IDEAL.i_drop))
+    R = v["R"] + stage.slope(i - v.get("i_offset", 0.0))
     states: tuple[str, ...] = ("position", "velocity", "current")
-    A = np.array([[0.0, 1.0, 0.0], [-k_x / m, -c / m, k_i / m], [0.0, -k_i / ell, -v["R"] / ell]])
+    A = np.array([[0.0, 1.0, 0.0], [-k_x / m, -c / m, k_i / m], [0.0, -k_i / ell, -R / ell]])
     B, C = np.array([[0.0], [0.0], [1.0 / ell]]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     if estimate.eddy:
         states, a = (*states, "force"), v["a"]

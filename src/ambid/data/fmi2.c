@@ -68,7 +68,6 @@ static void restart(struct state *s, const struct plant_parameters *p)
     plant_reset(&s->plant, p);
     s->phase = STARTED;
     memset(s->input, 0, sizeof s->input);
-    memcpy(s->input, s->plant.past[0], sizeof s->plant.past[0]);
 }
 
 FMI(fmi2String, fmi2GetTypesPlatform)(void);
@@ -197,7 +196,7 @@ STATUS(fmi2SetReal, fmi2Component c, const fmi2ValueReference at[], size_t n, co
             changed = 1;
         }
     }
-    if (changed && of->state.phase < RUNNING) /* it begins at rest with the parameters that it then has */
+    if (changed && of->state.phase < RUNNING) /* it begins with the parameters that it then has */
         plant_reset(&of->state.plant, &of->state.plant.p);
     return fmi2OK;
 }

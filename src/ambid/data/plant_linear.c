@@ -1,34 +1,25 @@
-/* x' = A (x - rest) + B w, w = (inputs - rest, disturbances); its step is exact for inputs that are held. */
+/* x' = A x + B w, w = (inputs, disturbances), from the operating point; its step is exact for inputs that are held. */
 
 #define PLANT_COLUMNS (PLANT_INPUTS + PLANT_DISTURBANCES)
 
-static void plant_deviation(const struct plant_parameters *p, const double *x, const double *u, const double *d,
-                            double *dx, double *w)
+static void plant_acting(const double *u, const double *d, double *w)
 {
-    double rest[PLANT_STATES] = {0.0}, input[PLANT_INPUTS] = {0.0};
-    int i;
-
-    plant_rest(p, rest, input);
-    for (i = 0; i < PLANT_STATES; i++)
-        dx[i] = x[i] - rest[i];
-    for (i = 0; i < PLANT_INPUTS; i++)
-        w[i] = u[i] - input[i];
-    for (i = 0; i < PLANT_DISTURBANCES; i++)
-        w[PLANT_INPUTS + i] = d[i];
+    memcpy(w, u, PLANT_INPUTS * sizeof *w);
+    memcpy(w + PLANT_INPUTS, d, PLANT_DISTURBANCES * sizeof *w);
 }
 
 void plant_derivative(const struct plant_parameters *p, const double *x, const double *u, const double *d, double *dx)
 {
     double A[PLANT_STATES][PLANT_STATES] = {{0.0}}, B[PLANT_STATES][PLANT_COLUMNS] = {{0.0}};
-    double from[PLANT_STATES], w[PLANT_COLUMNS];
+    double w[PLANT_COLUMNS];
     int i, j;
 
     plant_matrices(p, A, B);
-    plant_deviation(p, x, u, d, from, w);
+    plant_acting(u, d, w);
     for (i = 0; i < PLANT_STATES; i++) {
         dx[i] = 0.0;
         for (j = 0; j < PLANT_STATES; j++)
-            dx[i] += A[i][j] * from[j];
+            dx[i] += A[i][j] * x[j];
         for (j = 0; j < PLANT_COLUMNS; j++)
             dx[i] += B[i][j] * w[j];
     }
@@ -120,7 +111,8 @@ static int plant_advance(struct plant *s, const double *u, const double *d, doub
     double from[PLANT_STATES], w[PLANT_COLUMNS];
     int i, j;
 
-    plant_deviation(&s->p, s->x, u, d, from, w);
+    memcpy(from, s->x, sizeof from);
+    plant_acting(u, d, w);
     for (i = 0; i < PLANT_STATES; i++) {
         for (j = 0; j < PLANT_STATES; j++)
             s->x[i] += over->P[i][j] * from[j];

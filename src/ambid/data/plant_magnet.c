@@ -1,11 +1,16 @@
-/* m x'' = f(x, i) - c x' + m g + d0,  u + d1 = R i + dlambda(x, i)/dt: force and flux linkage from one co-energy. */
+/* m x'' = f(x, i) - c x' + m g + d0,  u + d1 = R i + dlambda(x, i)/dt: force and flux linkage from one co-energy, of
+ * position, current and voltage as they are: what counts from the operating point, with what these are there. */
 
-static void plant_magnet(const struct plant_parameters *p, double x, double i, double *f, double *k_i, double *L)
+static double plant_current(const struct plant_parameters *p, const double *x)
 {
-    const double at = x - @x_offset@;
+    return x[2] + p->current_rest - p->i_offset;
+}
+
+static void plant_magnet(const struct plant_parameters *p, const double *x, double *f, double *k_i, double *L)
+{
+    const double at = x[0] + p->position_rest - @x_offset@, i = plant_current(p, x);
     int side;
 
-    (void)p;
     *f = *k_i = 0.0;
     *L = @L_leak@ + @L_rise@ * i * i / (i * i + @i_knee@ * @i_knee@);
     for (side = 0; side < 1 + PLANT_PAIR; side++) {
@@ -23,16 +28,17 @@ static void plant_magnet(const struct plant_parameters *p, double x, double i, d
 
 void plant_derivative(const struct plant_parameters *p, const double *x, const double *u, const double *d, double *dx)
 {
-    double pull, k_i, L, v = u[0] + @v_offset@ + d[1] - @v_drop@ * tanh(x[2] / @i_drop@);
+    const double i = plant_current(p, x);
+    double pull, k_i, L, v = u[0] + p->voltage_rest + @v_offset@ + d[1] - @v_drop@ * tanh(i / @i_drop@);
 
-    plant_magnet(p, x[0], x[2], &pull, &k_i, &L);
+    plant_magnet(p, x, &pull, &k_i, &L);
 #if PLANT_STATES > 3
     dx[3] = @a@ * (pull - x[3]);
     pull = x[3];
 #endif
     dx[0] = x[1];
     dx[1] = (pull - p->c * x[1] + d[0]) / p->m + @g@;
-    dx[2] = (v - p->R * x[2] - k_i * x[1]) / L;
+    dx[2] = (v - p->R * i - k_i * x[1]) / L;
 }
 
 /* A classical fourth-order step; of a rotor that lies on a stop only current and lagging force move. */
@@ -80,14 +86,14 @@ static int plant_advance(struct plant *s, const double *u, const double *d, doub
 void plant_outputs(const struct plant *s, double *y)
 {
     y[0] = s->x[0];
-    y[1] = s->x[2] + s->p.i_offset;
+    y[1] = s->x[2];
     y[2] = s->x[1];
 }
 
 /* The equations hold between the pole faces alone, though they give finite numbers beyond. */
 static int plant_settle(struct plant *s, int touched)
 {
-    const double at = s->x[0] - s->p.x_offset;
+    const double at = s->x[0] + s->p.position_rest - s->p.x_offset;
 
     if (!PLANT_EXPONENTIAL && (at <= -s->p.@length_name@ || (PLANT_PAIR && at >= s->p.@length_name@)))
         return PLANT_LOST;

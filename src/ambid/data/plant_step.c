@@ -1,5 +1,5 @@
 
-/* At rest, with some parameters: for example &plant_identified. */
+/* Where it begins, with some parameters: for example &plant_identified. */
 void plant_reset(struct plant *s, const struct plant_parameters *p)
 {
     const struct plant_parameters own = *p; /* which may be those of s */
@@ -7,11 +7,11 @@ void plant_reset(struct plant *s, const struct plant_parameters *p)
     memset(s, 0, sizeof *s);
     s->p = own;
     s->known = 1;
-    plant_rest(&s->p, s->x, s->past[0]);
+    plant_begin(&s->p, s->x);
 #if PLANT_FOLLOWS
     {
         double k_i, L;
-        plant_magnet(&s->p, s->x[0], s->x[2], &s->x[3], &k_i, &L);
+        plant_magnet(&s->p, s->x, &s->x[3], &k_i, &L);
     }
 #endif
 }

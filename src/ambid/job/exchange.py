@@ -19,9 +19,10 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.prediction import plant_form
 from ambid.control.law_files import comment_text, write_mat
 from ambid.errors import AmbidError, EstimationError, nearest
+from ambid.estimation.estimate import Continuous
 from ambid.job.files import EXPORT_ENDINGS, Files
 from ambid.job.results import rig_of
-from ambid.physics.linear_model import StateSpace, delayed, model
+from ambid.physics.linear_model import UNITS, StateSpace, delayed, model
 from ambid.physics.loop import UNLIMITED
 from ambid.physics.shaft import Disc, Material, Shaft, Step
 from ambid.rotor.estimate import RotorEstimate
@@ -38,6 +39,33 @@ _STIFF, _LIGHT, _THICK = 1e14, 1e-3, 0.05  # E, rho and diameter of the shaft of
 def plant_of(result: Any) -> Any:
     """Return the model of a linear result, whose inputs and outputs have names."""
     return result.plant if isinstance(result, RotorEstimate) else model(result.model)
+
+
+def continuous_of(result: Any) -> Continuous:
+    """Return the continuous plant about the operating point, which is the zero of every export."""
+    if not isinstance(result, NonlinearBearingEstimate):
+        return result.continuous  # type: ignore[no-any-return]
+    rest = _operating_point(result)
+    return linearised(result, rest["position"], rest["current"])
+
+
+def _operating_point(result: Any) -> dict[str, float]:
+    """Return what signals are, SI, where an export's are zero; empty for a rotor, whose estimate has no means."""
+    if isinstance(result, BlackBoxFit):
+        levels = np.concatenate([result.offsets.u, result.offsets.y]).tolist()
+        return dict(zip((*result.inputs, *result.outputs), levels, strict=True))
+    if isinstance(result, NonlinearBearingEstimate):
+        from ambid.job.plant_source import rest_of
+
+        return rest_of(result)
+    return {} if isinstance(result, RotorEstimate) else dict(result.operating_point)
+
+
+def _zero(result: Any) -> str:
+    """Say from what the signals of an export count."""
+    units = result.units if isinstance(result, BlackBoxFit) else UNITS
+    at = ", ".join(f"{name} {x!r} {units[name]}" for name, x in _operating_point(result).items())
+    return f"Inputs and outputs count from the operating point: {at or 'the mean of each signal over the record'}."
 
 
 def export(result: Any, path: str | Path, to: str | None = None, *, anyway: bool = False) -> None:
@@ -67,7 +95,7 @@ def write_plant(result: Any, path: Path, name: str, to: str | None = None, *, an
         raise EstimationError(
             f"{doubt}; its plant is not exported. Identify it better, or give {setting('anyway', True)}"
         )
-    about = [*_about(result), *([f"NOT TO BE RELIED ON: {doubt}."] if doubt else [])]
+    about = [*_about(result), _zero(result), *([f"NOT TO BE RELIED ON: {doubt}."] if doubt else [])]
     ross = ending == ".py" and (isinstance(result, RotorEstimate) if to is None else to == "ross")
     if ross and not isinstance(result, RotorEstimate):
         raise EstimationError("a script for ROSS holds a rotor; this result is none. Export it for python-control")
@@ -104,6 +132,9 @@ def _doubt(result: Any) -> str:
     if not isinstance(result, BlackBoxFit):  # whose coefficients mean nothing one by one
         unseen = [p.name for p in (*result.parameters, *getattr(result, "mode_parameters", ())) if not p.identifiable]
         found += [f"its record does not show {', '.join(unseen)}"] if unseen else []
+        positive = {spec.name for spec in plant_of(result).parameters if spec.positive}
+        found += [f"{p.name} = {p.value:g} {p.unit} is not positive" for p in result.parameters
+                  if p.name in positive and not p.value > 0.0]  # fmt: skip
     return ", and ".join(found)
 
 
@@ -128,7 +159,7 @@ def _about(result: Any) -> list[str]:
 def _space(result: Any) -> tuple[Any, Any, Array, float]:
     """Return states with A, B and C, the model whose signals have names, the delays in samples, the period in s."""
     bearing = isinstance(result, NonlinearBearingEstimate)
-    at, plant = linearised(result) if bearing else result.continuous, plant_of(result)
+    at, plant = continuous_of(result), plant_of(result)
     rate = float(str((result.records[0] if bearing else result.record)["rate_hz"]))
     late = {"voltage": result.delay_samples(rate) or 0.0} if bearing else {
         role: x.samples + x.fraction for role, x in result.delay.items()
@@ -152,6 +183,7 @@ def _matrices(result: Any) -> dict[str, Any]:
     if isinstance(result, BlackBoxFit):
         form = plant_form(result)
         names = {"inputs": _cells(result.inputs), "outputs": _cells(result.outputs)}
+        names |= {"input_rest": result.offsets.u, "output_rest": result.offsets.y}
         return {"A": form.A, "B": form.B, "C": form.C, "D": form.D, "sample_time_s": form.dt, **names}
     at, plant, delays, period = _space(result)
     found: dict[str, Any] = {
@@ -174,7 +206,7 @@ def _matrices(result: Any) -> dict[str, Any]:
             "mode_places": _cells(result.plant.places),
         }  # fmt: skip
     else:
-        found["operating_point"] = dict(result.operating_point)
+        found["operating_point"] = _operating_point(result)
     return found
 
 
@@ -207,6 +239,7 @@ def control_script(result: Any, about: list[str]) -> str:
             f"DT = {period!r}  # s", f"DELAY = {dict(zip(plant.inputs, delays.tolist(), strict=True))}  # samples",
             f"PARAMETERS = {{  # value, standard deviation, unit{''.join(_entry(p) for p in result.parameters)}\n}}",
         ]  # fmt: skip
+    begin += [f"OPERATING_POINT = {_operating_point(result)}  # what signals are where they are zero here, SI"]
     for name, (what, matrices, dt, labels) in parts.items():
         begin += [
             "", "", f"def {name}():", f'    """Return the plant, {what}."""',

@@ -1,5 +1,7 @@
 """An identified plant as C source (C99, math.h alone, no allocation), with the delay of its inputs, and as FMU.
 
+Position, current and voltage, of states, inputs, outputs and stops, count from the operating point.
+
 A linear plant steps by exact zero-order-hold matrices of its parameters, a nonlinear magnet by the simulator's
 Runge-Kutta steps and stops; code in ``data/plant_*.c``. An FMU (FMI 2.0 for co-simulation) holds source and this
 machine's binary, byte by byte the same for the same estimate and compiler.
@@ -14,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from importlib.resources import files
@@ -75,7 +77,7 @@ class PlantSource:
 
     numbers: tuple[Number, ...]  # delays last, one for each input
     states: Mapping[str, str]
-    inputs: Mapping[str, tuple[str, float]]  # with the value at rest
+    inputs: Mapping[str, str]
     disturbances: Mapping[str, str]
     outputs: Mapping[str, str]
     period: float  # of the record, s
@@ -107,13 +109,13 @@ def _of_axis(result: Estimate, stops: Interval) -> PlantSource:
     entries = _MATRICES[of.name]
     filled = [f"    {name}[{i}][{j}] = {text};" for name in "AB" for (i, j), text in entries[name].items()]
     late = result.delay[of.inputs[0]]
-    rested = {role: at[role] for role in (*of.outputs, *of.inputs)}
     return PlantSource(
-        numbers=(*numbers, *_rests(rested), *_stops(stops, "position" in of.states),
+        numbers=(*numbers, *_rests({role: at[role] for role in (*of.outputs, *of.inputs)}, of.states),
+                 *_stops(stops, at.get("position") if "position" in of.states else None),
                  _delay("delay", (late.samples + late.fraction) * period)),
-        states={s: units[s] for s in of.states}, inputs={r: (units[r], at[r]) for r in of.inputs},
+        states={s: units[s] for s in of.states}, inputs={r: units[r] for r in of.inputs},
         disturbances=_disturbances(of.disturbances), outputs={o: units[o] for o in shown}, period=period,
-        code=_linear(filled, rows, _rest_lines(of.states, of.inputs, rested), stop="position" in of.states),
+        code=_linear(filled, rows, _start_lines(of.states, of.outputs), stop="position" in of.states),
         more="", members=_KEPT,
     )  # fmt: skip
 
@@ -125,10 +127,10 @@ def _of_rotor(result: RotorEstimate) -> PlantSource:
     tables = [_table(name, x) for name, x in (("a", result.continuous.A), ("b", B))]
     filled = ["    (void)p;", "    memcpy(A, plant_a, sizeof plant_a);", "    memcpy(B, plant_b, sizeof plant_b);"]
     late = {r: result.delay[r].samples + result.delay[r].fraction if r in result.delay else 0.0 for r in of.inputs}
-    code = _linear(filled, result.continuous.C, ["    (void)p, (void)x, (void)u;"], stop=False)
+    code = _linear(filled, result.continuous.C, ["    (void)p, (void)x;"], stop=False)
     return PlantSource(
         numbers=tuple(_delay(f"{r}_delay", x * period) for r, x in late.items()),
-        states={s: units[s] for s in of.states}, inputs={r: (units[r], 0.0) for r in of.inputs},
+        states={s: units[s] for s in of.states}, inputs={r: units[r] for r in of.inputs},
         disturbances={f"disturbing_{d}": units[d] for d in of.disturbances},
         outputs={o: units[o] for o in of.outputs}, period=period, code="\n".join([*tables, code]), more="",
         members=_KEPT,
@@ -136,8 +138,8 @@ def _of_rotor(result: RotorEstimate) -> PlantSource:
 
 
 def _of_magnet(result: NonlinearBearingEstimate, stops: Interval) -> PlantSource:
-    plant = plant_of_law(result.law, result.values, eddy=result.eddy)
-    rest, rate = plant.equilibrium(result.operating_point["position"]), float(str(result.records[0]["rate_hz"]))
+    plant, rate = plant_of_law(result.law, result.values, eddy=result.eddy), float(str(result.records[0]["rate_hz"]))
+    rest = plant.equilibrium(result.operating_point["position"])
     states = {s: UNITS[s] for s in ("position", "velocity", "current")} | ({"pull": "N"} if result.eddy else {})
     values = {**_ALWAYS, **result.values}
     numbers = [
@@ -148,13 +150,12 @@ def _of_magnet(result: NonlinearBearingEstimate, stops: Interval) -> PlantSource
     named = {name: f"p->{name}" if name in values else repr(x) for name, x in _ABSENT.items()} | {
         "x_offset": "p->x_offset", "strength": f"p->{strength}", "length": f"p->{length}", "length_name": length,
     }  # fmt: skip
-    rested = {"position": rest.position, "current": rest.current, "voltage": rest.voltage}
     return PlantSource(
-        numbers=(*numbers, *_rests(rested), *_stops(stops, True),
+        numbers=(*numbers, *_rests(rest_of(result), states), *_stops(stops, rest.position),
                  _delay("delay", (result.delay_samples(rate) or 0.0) / rate)),
-        states=states, inputs={"voltage": ("V", rest.voltage)}, disturbances=_disturbances(("force", "voltage")),
+        states=states, inputs={"voltage": "V"}, disturbances=_disturbances(("force", "voltage")),
         outputs={o: UNITS[o] for o in ("position", "current", "velocity")}, period=1.0 / rate,
-        code="\n".join([*_rest(_rest_lines(tuple(states), ("voltage",), rested)), *_stop(True), "", re.sub(
+        code="\n".join([*_begin(_start_lines(tuple(states), ("position", "current"))), *_stop(True), "", re.sub(
             r"@(\w+)@", lambda found: named[found[1]], read_data("plant_magnet.c"))]),
         more="\n".join([
             f"#define PLANT_PAIR {int(result.law.pair)}",
@@ -165,19 +166,33 @@ def _of_magnet(result: NonlinearBearingEstimate, stops: Interval) -> PlantSource
     )  # fmt: skip
 
 
+def rest_of(result: NonlinearBearingEstimate) -> dict[str, float]:
+    """Return position, current and voltage, as measured, where the magnet holds its load at the mean position."""
+    plant = plant_of_law(result.law, result.values, eddy=result.eddy)
+    rest = plant.equilibrium(result.operating_point["position"])._asdict()
+    return {**rest, "current": rest["current"] + result.values.get("i_offset", 0.0)}
+
+
 def _number(of: ParameterSpec, value: float) -> Number:
     least = _POSITIVE if of.positive else 0.0 if of.name in ("sigma", "L_leak", "L_rise") else ANY
     return Number(name=of.name, unit=of.unit, about=of.meaning, value=value, least=least if value >= least else ANY)
 
 
-def _rests(values: Mapping[str, float]) -> list[Number]:
-    about = "at the operating point, where the plant starts"
-    return [Number(name=f"{r}_rest", unit=UNITS[r], about=about, value=x, tunable=False) for r, x in values.items()]
+def _rests(values: Mapping[str, float], states: Collection[str]) -> list[Number]:
+    said = {"rest": "the operating point, from which it counts", "start": "where it starts, from the operating point"}
+    kept = [("rest", values), ("start", {r: 0.0 for r in values if r in states})]
+    return [
+        Number(name=f"{r}_{what}", unit=UNITS[r], about=said[what], value=x, tunable=False)
+        for what, of in kept for r, x in of.items()
+    ]  # fmt: skip
 
 
-def _stops(stops: Interval, moves: bool) -> list[Number]:
-    low, high = (math.copysign(_FREE, x) if math.isinf(x) else x for x in stops)
-    ends = {"position_low": ("lower", low), "position_high": ("upper", high)} if moves else {}
+def _stops(stops: Interval, rest: float | None) -> list[Number]:
+    """Return the stops of a rotor that rests at a position; none of what does not move."""
+    if rest is None:
+        return []
+    low, high = (math.copysign(_FREE, x) if math.isinf(x) else x - rest for x in stops)
+    ends = {"position_low": ("lower", low), "position_high": ("upper", high)}
     return [Number(name=n, unit="m", about=f"{which} stop of the rotor", value=x) for n, (which, x) in ends.items()]
 
 
@@ -205,15 +220,13 @@ _KEPT = """    struct plant_transition {
 """
 
 
-def _rest_lines(states: Sequence[str], inputs: Sequence[str], rested: Mapping[str, float]) -> list[str]:
-    found = [f"    {to}[{k}] = p->{name}_rest;" for to, names in (("x", states), ("u", inputs))
-             for k, name in enumerate(names) if name in rested]  # fmt: skip
-    return found
+def _start_lines(states: Sequence[str], measured: Collection[str]) -> list[str]:
+    return [f"    x[{k}] = p->{name}_start;" for k, name in enumerate(states) if name in measured]
 
 
-def _rest(lines: Sequence[str]) -> list[str]:
-    """Return the function that writes the states and inputs at rest which are not zero."""
-    return ["static void plant_rest(const struct plant_parameters *p, double *x, double *u)", "{", *lines, "}", ""]
+def _begin(lines: Sequence[str]) -> list[str]:
+    """Return the function that writes the states in which the plant starts."""
+    return ["static void plant_begin(const struct plant_parameters *p, double *x)", "{", *lines, "}", ""]
 
 
 def _stop(moves: bool) -> list[str]:
@@ -227,10 +240,10 @@ def _stop(moves: bool) -> list[str]:
             "static int plant_stop(struct plant *s)", "{", f"    {ends}", "}"]  # fmt: skip
 
 
-def _linear(filled: Sequence[str], rows: Array, rest: Sequence[str], *, stop: bool) -> str:
+def _linear(filled: Sequence[str], rows: Array, start: Sequence[str], *, stop: bool) -> str:
     wide = "B[PLANT_STATES][PLANT_INPUTS + PLANT_DISTURBANCES]"
     return "\n".join([
-        _table("C", rows), "", *_rest(rest),
+        _table("C", rows), "", *_begin(start),
         f"static void plant_matrices(const struct plant_parameters *p, double A[PLANT_STATES][PLANT_STATES],\n"
         f"                           double {wide})", "{", *filled, "}", "", *_stop(stop), "",
         read_data("plant_linear.c"),
@@ -248,7 +261,7 @@ def declarations(of: PlantSource, about: Sequence[str]) -> str:
     longest = max((x.value for x in of.numbers[len(own) :]), default=0.0)
     listed = {
         "x": of.states,
-        "u": {k: unit for k, (unit, _) in of.inputs.items()},
+        "u": of.inputs,
         "d": of.disturbances,
         "y": of.outputs,
     }
@@ -259,8 +272,9 @@ def declarations(of: PlantSource, about: Sequence[str]) -> str:
     return "\n".join([
         f"/* {comment_text(about[0])}", *(f" * {comment_text(line)}" for line in about[1:]), " *",
         *(f" * {key}: {comment_text(text)}" for key, text in words.items()), " *",
-        " * All in SI. plant_reset once; then, each sample, plant_outputs, and plant_step with the inputs that the",
-        " * plant was just given, the disturbances, and how long both are held (such as PLANT_PERIOD).",
+        " * All in SI; position, current, voltage and the stops count from the operating point (what ends in _rest).",
+        " * plant_reset once; then, each sample, plant_outputs, and plant_step with the inputs that the plant was just",
+        " * given, the disturbances, and how long both are held (such as PLANT_PERIOD).",
         " * plant_step returns 1 where the rotor touched a stop, else 0, or one of the negative numbers below.", " */",
         "#ifndef PLANT_DECLARED", "#define PLANT_DECLARED", "", "#include <math.h>", "#include <string.h>", "",
         *(f"#define PLANT_{name} {n}" for name, n in sizes.items()),
@@ -295,8 +309,7 @@ def c_source(of: PlantSource, about: Sequence[str]) -> str:
 
 def prefixed(text: str, stem: str) -> str:
     """Return C source with a prefix of its own, so that one program may hold several plants; `stem`: of the file."""
-    name = re.sub(r"[^A-Za-z0-9]+", "_", stem).strip("_").lower()[:40]
-    name = name if name[:1].isalpha() and name.isascii() else f"plant_{name}".rstrip("_")
+    name = identifier(stem.lower(), 40)
     found = re.sub(r"\bplant_(?=\w)", f"{name}_", re.sub(r"\bPLANT_(?=\w)", f"{name.upper()}_", text))
     return re.sub(r"\bstruct plant\b", f"struct {name}", found)
 
@@ -308,22 +321,29 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 _FLAGS = ("-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden")
 _SECONDS = 120.0
 _LONGEST = 60  # letters of an identifier
+_WORDS = """
+alignas alignof and asm auto bitand bitor bool break case catch char class compl concept const consteval constexpr
+constinit continue decltype default delete do double else enum explicit export extern false float for friend goto if
+i386 inline int linux long mutable namespace new noexcept not nullptr operator or private protected public register
+requires restrict return short signed sizeof static struct switch template this throw true try typedef typeid typename
+typeof union unix unsigned using virtual void volatile while xor
+"""  # which can name no structure: keywords of C and C++, and what compilers define
 
 
 def write_fmu(of: PlantSource, path: Path, name: str, about: Sequence[str]) -> None:
     """Write a plant; `name`: of the model, as the user gave it; `about`: lines that say what it is."""
     least = ", ".join(repr(x.least) for x in of.numbers)
     sources = {"plant.c": c_source(of, about), "fmi2.c": f"#define PLANT_LEAST {least}\n{read_data('fmi2.c')}"}
-    identifier = _identifier(name)
-    seen = sha256("\0".join([identifier, *sources.values()]).encode()).hexdigest()
+    of_model = identifier(name, _LONGEST)
+    seen = sha256("\0".join([of_model, *sources.values()]).encode()).hexdigest()
     guid = "{" + "-".join(seen[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32))) + "}"
     sources["fmi2.c"] = f'#define PLANT_GUID "{guid}"\n{sources["fmi2.c"]}'
     entries: dict[str, bytes] = {
         MARK: b"An identified plant, written by ambid.\n",
-        "modelDescription.xml": model_description(of, name, identifier, guid, about).encode(),
+        "modelDescription.xml": model_description(of, name, of_model, guid, about).encode(),
         **{f"sources/{file}": text.encode() for file, text in sources.items()},
     }
-    entries |= _binary(sources, identifier)
+    entries |= _binary(sources, of_model)
     with zipfile.ZipFile(path, "w") as made:
         for entry, content in entries.items():
             information = zipfile.ZipInfo(entry, _DATE)
@@ -333,13 +353,13 @@ def write_fmu(of: PlantSource, path: Path, name: str, about: Sequence[str]) -> N
             made.writestr(information, content, plain)
 
 
-def _identifier(name: str) -> str:
+def identifier(name: str, longest: int) -> str:
     """Return a name that C and file systems take, of what the user called the model."""
-    kept = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:_LONGEST]
-    return kept if kept[:1].isalpha() else f"plant_{kept}".rstrip("_")
+    kept = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:longest]
+    return kept if kept[:1].isalpha() and kept not in _WORDS.split() else f"plant_{kept}".rstrip("_")
 
 
-def _binary(sources: Mapping[str, str], identifier: str) -> dict[str, bytes]:
+def _binary(sources: Mapping[str, str], of_model: str) -> dict[str, bytes]:
     """Compile the sources for this machine; nothing where there is no compiler, or it cannot."""
     compiler = next((found for found in map(shutil.which, ("cc", "gcc", "clang")) if found), None)
     if compiler is None:
@@ -355,7 +375,7 @@ def _binary(sources: Mapping[str, str], identifier: str) -> dict[str, bytes]:
             subprocess.run(words, cwd=room, check=True, capture_output=True, timeout=_SECONDS)
         except (OSError, subprocess.SubprocessError):
             return {}
-        return {f"binaries/{folder}/{identifier}{ending}": (Path(room) / "made").read_bytes()}
+        return {f"binaries/{folder}/{of_model}{ending}": (Path(room) / "made").read_bytes()}
 
 
 def binaries(path: Path) -> tuple[str, ...]:
@@ -364,18 +384,20 @@ def binaries(path: Path) -> tuple[str, ...]:
         return tuple(name.split("/")[1] for name in made.namelist() if name.startswith("binaries/"))
 
 
-def model_description(of: PlantSource, name: str, identifier: str, guid: str, about: Sequence[str]) -> str:
+def model_description(of: PlantSource, name: str, of_model: str, guid: str, about: Sequence[str]) -> str:
     """Return modelDescription.xml: references count parameters, inputs and disturbances, outputs."""
-    driven = {**{k: (unit, rest, "what acts on the plant, late by its delay") for k, (unit, rest) in of.inputs.items()},
-              **{k: (unit, 0.0, "disturbance, acts at once") for k, unit in of.disturbances.items()}}  # fmt: skip
+    driven = {**{k: (unit, "from the operating point, late by its delay") for k, unit in of.inputs.items()},
+              **{k: (unit, "disturbance, acts at once") for k, unit in of.disturbances.items()}}  # fmt: skip
     variables = [
         _variable(x.name, x.about, x.unit, f'causality="parameter" variability="{_WHEN[x.tunable]}" initial="exact"',
                   x.value, x.least) for x in of.numbers
     ]  # fmt: skip
-    variables += [_variable(k, text, unit, 'causality="input" variability="continuous"', start)
-                  for k, (unit, start, text) in driven.items()]  # fmt: skip
+    variables += [_variable(k, text, unit, 'causality="input" variability="continuous"', 0.0)
+                  for k, (unit, text) in driven.items()]  # fmt: skip
     variables += [
-        _variable(k, "of the plant", unit, 'causality="output" variability="continuous" initial="calculated"')
+        _variable(
+            k, "from the operating point", unit, 'causality="output" variability="continuous" initial="calculated"'
+        )
         for k, unit in of.outputs.items()
     ]
     if len({*(x.name for x in of.numbers), *driven, *of.outputs}) != len(variables):
@@ -388,7 +410,7 @@ def model_description(of: PlantSource, name: str, identifier: str, guid: str, ab
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<fmiModelDescription fmiVersion="2.0" modelName={_quoted(name)} guid="{guid}"'
         f' description={_quoted(" ".join(about))} generationTool="ambid" variableNamingConvention="flat">',
-        f'<CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="true"'
+        f'<CoSimulation modelIdentifier="{of_model}" canHandleVariableCommunicationStepSize="true"'
         ' canGetAndSetFMUstate="true" canSerializeFMUstate="true">',
         '<SourceFiles><File name="fmi2.c"/></SourceFiles>', "</CoSimulation>",
         "<UnitDefinitions>", *(f"<Unit name={_quoted(unit)}/>" for unit in units), "</UnitDefinitions>",

@@ -12,7 +12,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
+from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.prediction import (
     errors,
@@ -26,7 +26,7 @@ from ambid.blackbox.prediction import to_control as black_box_to_control
 from ambid.errors import EstimationError, needs
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, signals_of
-from ambid.job.exchange import export, plant_of
+from ambid.job.exchange import continuous_of, export, plant_of
 from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.linear_model import StateSpace, discretise, model
@@ -211,7 +211,7 @@ def to_control(result: Any) -> Any:
         found = black_box_to_control(result.model)
         found.update_names(inputs=list(result.inputs), outputs=list(result.outputs))
         return found
-    at = linearised(result) if isinstance(result, NonlinearBearingEstimate) else result.continuous
+    at = continuous_of(result)
     found = state_space_to_control(at.A, at.B, at.C)
     plant = plant_of(result)
     found.update_names(inputs=list(plant.inputs), outputs=list(plant.outputs), states=list(at.states))
