@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 from scipy.io import loadmat
 
 import ambid
 from ambid.errors import AmbidError, EstimationError
 from ambid.rotor.estimate import RotorEstimate
-from tests.job.exported import InC, needs_compiler
+from tests.job.exported import assert_agree, needs_compiler, runs_of_exports
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -35,8 +36,10 @@ def estimate(bench: Any) -> RotorEstimate:
     return found
 
 
-def _built(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
-    """Run a script with a stand-in for ROSS; return its names, and what it made of each kind."""
+def _built(
+    path: Path, monkeypatch: pytest.MonkeyPatch, version: str = "2.3.0"
+) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
+    """Run a script with a stand-in for a version of ROSS; return its names, and what it made of each kind."""
     made: dict[str, list[dict[str, Any]]] = {
         "Material": [],
         "ShaftElement": [],
@@ -44,7 +47,8 @@ def _built(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[str, Any],
         "BearingElement": [],
     }
     parts = {kind: lambda kind=kind, **words: made[kind].append(words) or words for kind in made}
-    monkeypatch.setitem(sys.modules, "ross", SimpleNamespace(**parts, Rotor=lambda *parts: parts))  # type: ignore[arg-type]
+    ross = SimpleNamespace(**parts, Rotor=lambda *parts: parts, __version__=version)
+    monkeypatch.setitem(sys.modules, "ross", ross)  # type: ignore[arg-type]
     names: dict[str, Any] = {"__name__": "script"}
     exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), names)
     names["rotor"]()
@@ -62,18 +66,48 @@ def test_the_script_for_ross_holds_the_rotor_with_synchronous_bearings(
     span = estimate.numbers["B.z_sensor"] - estimate.numbers["A.z_sensor"]
     assert sum(e["L"] for e in made["ShaftElement"]) == pytest.approx(span)
     f = np.array([bench.rpm / 60.0])
-    s, late = 2j * np.pi * f[0], np.exp(-2j * np.pi * f[0] * (bench.delay + 0.5) / bench.rate)
-    back = bench.kc * truth.controller_frf(bench, f)[0] * late
-    for k, one in enumerate(made["BearingElement"]):
-        for plane, j in (("x", 2 * k), ("y", 2 * k + 1)):
-            i = (back + bench.k_i[j] * s) / (bench.R[j] + bench.L[j] * s + bench.kc * late)
-            stiffness = bench.k_x[j] + bench.k_i[j] * i
-            assert one[f"k{plane}{plane}"] == pytest.approx(stiffness.real, rel=0.03)
-            assert one[f"c{plane}{plane}"] == pytest.approx(stiffness.imag / abs(s), rel=0.03)
+    for one, stiffness in zip(made["BearingElement"], _stiffness(bench, f), strict=True):
+        for plane, wanted in zip("xy", stiffness, strict=True):
+            assert one[f"k{plane}{plane}"] == pytest.approx(wanted[0].real, rel=0.03)
+            assert one[f"c{plane}{plane}"] == pytest.approx(wanted[0].imag / (2.0 * np.pi * f[0]), rel=0.03)
     A, B, C = names["state_space"]()
     np.testing.assert_array_equal(A, estimate.continuous.A)
     assert B.shape[1] == len(names["INPUTS"])
     assert C.shape[0] == len(names["OUTPUTS"])
+
+
+def _stiffness(bench: Any, f: Any) -> Any:
+    """-force over motion of each axis of two bearings at frequencies in Hz, by the numbers of the bench, (2, 2, n)."""
+    s, late = 2j * np.pi * f, np.exp(-2j * np.pi * f * (bench.delay + 0.5) / bench.rate)
+    back = bench.kc * truth.controller_frf(bench, f) * late
+    found = [
+        bench.k_x[j]
+        + bench.k_i[j] * (back + bench.k_i[j] * s) / (bench.R[j] + bench.L[j] * s + bench.kc * late)
+        for j in range(4)
+    ]  # fmt: skip
+    return np.array(found).reshape(2, 2, -1)
+
+
+def test_the_bearings_for_ross_3_are_tables_over_whirl_frequency_and_speed(
+    bench: Any, estimate: RotorEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimate.export(tmp_path / "r.py")
+    _, made = _built(tmp_path / "r.py", monkeypatch, "3.1.0")
+    f = np.array([15.0, 40.0, 110.0, 300.0, 900.0])  # ROSS 3 interpolates monotonically between what the table holds
+    for one, stiffness in zip(made["BearingElement"], _stiffness(bench, f), strict=True):
+        assert "speed" not in one
+        for plane, wanted in zip("xy", stiffness, strict=True):
+            k, c = (PchipInterpolator(one["frequency"], one[f"{x}{plane}{plane}"])(2.0 * np.pi * f) for x in "kc")
+            np.testing.assert_allclose(k + 2j * np.pi * f * c, wanted, rtol=0.03)
+    assert estimate.used is not None
+    slower = {**estimate.records[0], "speed": 900.0}
+    replace(estimate, records=(*estimate.records, slower), used=estimate.used * 2).export(tmp_path / "r.py")
+    names, made = _built(tmp_path / "r.py", monkeypatch, "3.1.0")
+    one = made["BearingElement"][0]
+    assert one["speed"] == names["SPEEDS"] == [900.0, estimate.speed]
+    assert np.shape(one["kxx"]) == np.shape(one["cyy"]) == (2, len(one["frequency"]))
+    kept = names["WHIRL"].index(estimate.speed)
+    assert _built(tmp_path / "r.py", monkeypatch)[1]["BearingElement"][0]["kxx"] == one["kxx"][1][kept]
 
 
 def test_an_estimate_without_its_record_knows_no_controller(
@@ -105,20 +139,11 @@ def test_python_control_gets_named_signals(estimate: RotorEstimate) -> None:
 
 
 @needs_compiler
-def test_c_source_runs_the_rotor_at_its_speed(estimate: RotorEstimate, tmp_path: Path) -> None:
+def test_all_exports_of_a_rotor_agree(estimate: RotorEstimate, tmp_path: Path) -> None:
     late = replace(estimate.delay["by_voltage"], samples=2, fraction=0.3)
     estimate = replace(estimate, delay={**estimate.delay, "by_voltage": late})
-    period = 1.0 / float(str(estimate.record["rate_hz"]))
-    estimate.export(tmp_path / "r.mat")
-    read = loadmat(tmp_path / "r.mat", squeeze_me=True, simplify_cells=True)["sampled"]
-    plant, x, scale = InC(estimate, tmp_path), np.zeros(read["A"].shape[0]), np.abs(read["C"]).max()
     u = np.random.default_rng(1).standard_normal((40, 4))
-    for row in u:
-        wanted = read["C"] @ x
-        found = plant.outputs()[: wanted.size]
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12 * scale * np.abs(x).max())
-        assert plant.step(row, period) == 0
-        x = read["A"] @ x + read["B"] @ row
+    assert_agree(runs_of_exports(estimate, tmp_path, u))
 
 
 def test_a_rotor_is_an_fmu_and_a_script_for_python_control(estimate: RotorEstimate, tmp_path: Path) -> None:

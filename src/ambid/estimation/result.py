@@ -313,9 +313,9 @@ class Linear:
         ----------
         path : str or Path
             Ending in ``.mat``: matrices, names, parameters with covariance. In ``.py``: a script for python-control, or
-            of a rotor one that builds it for ROSS, its bearings at the synchronous frequency. Of an estimate also
-            ``.c`` or ``.h``: C source, or its declarations. ``.fmu``: FMI 2.0 for co-simulation. An export that exists
-            is replaced, anything else is refused.
+            of a rotor one that builds it for ROSS, 2.x and 3. Of an estimate also ``.c`` or ``.h``: C source, or its
+            declarations. ``.fmu``: FMI 2.0 for co-simulation. An export that exists is replaced, anything else is
+            refused.
         to : {"control", "ross"}, optional
             For which library a script is.
         anyway : bool, optional

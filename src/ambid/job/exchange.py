@@ -1,6 +1,7 @@
 """Results for other programs: ``.mat``, python-control, C source, FMU; a rotor as a script for ROSS.
 
-ROSS reads bearings at the running speed alone: a controlled magnet's stand for the synchronous frequency, plant beside.
+ROSS 3 takes bearings as tables over whirl frequency and speed; before, it reads them at the running speed alone, and a
+controlled magnet's stand for the synchronous frequency.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ SCRIPTS = ("control", "ross")
 """For which library a script can be."""
 
 _LATEST = 1000  # samples by which an input may act late
-_STILL = 1.0  # Hz at which the bearings of a rotor at rest are read
+_STILL = 1.0  # Hz at which the bearings of a rotor at rest are read, and where their tables begin
+_POINTS, _HIGHEST = 80, 0.45  # of these tables, the latter of the sampling rate
 _STIFF, _LIGHT, _THICK = 1e14, 1e-3, 0.05  # E, rho and diameter of the shaft of a rotor without drawing
 
 
@@ -266,29 +268,45 @@ def ross_script(estimate: RotorEstimate, about: list[str]) -> str:
     from ambid.rig import rig_from_text
 
     rig = rig_from_text(str(estimate.rig["text"]), str(estimate.rig["name"]))
-    theta, plant = estimate.numbers, estimate.plant
-    frequency = abs(estimate.speed) / (2.0 * np.pi) or _STILL
-    K = _controller(estimate, rig, frequency)
+    theta, (_, plant, delays, period) = estimate.numbers, _space(estimate)
+    synchronous = abs(estimate.speed) or 2.0 * np.pi * _STILL
+    end = 2.0 * np.pi * _HIGHEST / period
+    whirl = np.unique([*np.geomspace(2.0 * np.pi * _STILL, end, _POINTS), synchronous])
+    K = _controllers(estimate, rig, whirl)
     planes = [theta[place] for place in plant.places]
     shaft = rig.shaft or _rigid(planes, theta)
     z = np.asarray(shaft.free_rotor(1, planes=[*planes, theta["z_cg"]]).z)
-    stiffness = [_stiffness(estimate, K, frequency, j) for j in range(len(plant.axes))]
-    read = "the loop and the magnets" if K is not None else "the magnets alone (no controller is known)"
+    read = "the loop and the magnets" if K else "the magnets alone (no controller is known)"
     of = "the drawing" if rig.shaft else "m, Id and Ip on a shaft that does not bend (no drawing is known)"
+    axes = {"frequency": "WHIRL", **({"speed": "SPEEDS"} if len(K) > 1 else {})}
     return "\n".join([
         f'"""{about[0]}', "", *about[1:], "",
-        f"Shaft: {of}. Bearings: synchronous, {read} at {frequency:.6g} Hz; at other frequencies they are wrong.",
-        'The identified plant, all frequencies, is state_space(): x\' = A x + B u, y = C x, SI.', '"""', "",
+        f"Shaft: {of}. Bearings: {read}, in ROSS 3 over whirl frequency{' and speed' * (len(K) > 1)}, in ROSS 2",
+        f"synchronous, at {synchronous / (2.0 * np.pi):.6g} Hz; at other frequencies those are wrong.",
+        'The identified plant, all frequencies, is state_space(): x\' = A x + B u, y = C x, SI, u late by DELAY.',
+        '"""', "",
         "import numpy as np", "import ross as rs", "", f"SPEED = {estimate.speed!r}  # rad/s",
+        f"WHIRL = {whirl.tolist()}  # rad/s", f"SPEEDS = {sorted(K)}  # rad/s",
         f"INPUTS = {list(plant.inputs)}", f"OUTPUTS = {list(plant.outputs)}",
-        f"STATES = {list(estimate.continuous.states)}", "", "", "def rotor():",
+        f"DELAY = {[x * period for x in delays.tolist()]}  # s, by which each input acts late",
+        f"STATES = {list(estimate.continuous.states)}",
+        "TABLES = int(getattr(rs, \"__version__\", \"2\").split(\".\")[0]) >= 3", "", "",
+        "def bearing(n, tag, **table):",
+        '    """Return a bearing by its table; before ROSS 3 synchronous, at SPEED."""',
+        "    if TABLES:",
+        f"        return rs.BearingElement(n=n, tag=tag, {', '.join(f'{k}={v}' for k, v in axes.items())}, **table)",
+        f"    at = WHIRL.index({synchronous!r})",
+        "    there = {name: float(np.atleast_2d(x)[-1, at]) for name, x in table.items()}",
+        "    return rs.BearingElement(n=n, tag=tag, **there)",
+        "", "", "def rotor():",
         '    """Return the rotor: shaft, discs, bearings."""', *_elements(shaft, z),
-        "    discs = [", *_discs(shaft, z), "    ]", "    bearings = [", *_bearings(estimate, stiffness, z),
+        "    discs = [", *_discs(shaft, z), "    ]", "    bearings = [", *_bearings(estimate, K, whirl, z),
         "    ]", "    return rs.Rotor(shaft, discs, bearings)", "", "", "def state_space():",
         '    """Return A, B, C."""',
         *(f"    {x} = np.array({getattr(estimate.continuous, x).tolist()})" for x in "ABC"),
         "    return A, B, C", "", "", 'if __name__ == "__main__":',
-        "    print(rotor().run_modal(SPEED).wd / (2 * np.pi), \"Hz\")", "",
+        "    found = rotor().run_modal(SPEED, **({\"matched_whirl\": True} if TABLES else {}))",
+        "    print(found.wd / (2 * np.pi), \"Hz\")", "",
     ])  # fmt: skip
 
 
@@ -322,18 +340,23 @@ def _discs(shaft: Shaft, z: Array) -> list[str]:
     return [f"        rs.DiskElement(n={_node(z, d.z)}, m={d.m!r}, Id={d.Id!r}, Ip={d.Ip!r})," for d in shaft.discs]
 
 
-def _bearings(estimate: RotorEstimate, stiffness: list[complex], z: Array) -> list[str]:
-    """Return the bearings, stiffness and damping of each axis at the synchronous frequency."""
+def _bearings(estimate: RotorEstimate, K: Mapping[float, Complex], whirl: Array, z: Array) -> list[str]:
+    """Return the bearings, stiffness and damping of each axis over whirl frequency, by row over speed too."""
     theta, plant, lines = estimate.numbers, estimate.plant, []
-    W = abs(estimate.speed) or 2.0 * np.pi * _STILL
     for b in plant.bearings:
         node = _node(z, theta["z_cg"] if b.axial else theta[f"{b.name}.z"])
-        words = {"kxx": 0.0, "kyy": 0.0, "cxx": 0.0, "cyy": 0.0}
+        words = {name: np.zeros((max(len(K), 1), whirl.size)) for name in ("kxx", "kyy", "cxx", "cyy")}
         for plane, axis in zip("z" if b.axial else "xy", b.axes, strict=False):
-            k = stiffness[plant.axes.index(axis)]
-            words |= {f"k{plane}{plane}": k.real, f"c{plane}{plane}": k.imag / W}
-        said = ", ".join(f"{name}={x:.9g}" for name, x in words.items())
-        lines.append(f"        rs.BearingElement(n={node}, {said}, tag={b.name!r}),  # synchronous")
+            j = plant.axes.index(axis)
+            k = np.array([_stiffness(estimate, K[at], whirl, j) for at in sorted(K)] or [
+                np.full(whirl.size, theta[f"{axis}.k_x"], complex)
+            ])  # fmt: skip
+            words |= {f"k{plane}{plane}": k.real, f"c{plane}{plane}": k.imag / whirl}
+        lines.append(f"        bearing({node}, {b.name!r},")
+        for name, x in words.items():
+            table = [[float(f"{value:.9g}") for value in row] for row in x]
+            lines.append(f"            {name}={table[0] if len(table) == 1 else table},")
+        lines.append("        ),")
     return lines
 
 
@@ -341,45 +364,49 @@ def _node(z: Array, at: float) -> int:
     return int(np.argmin(np.abs(z - at)))
 
 
-def _controller(estimate: RotorEstimate, rig: Any, frequency_hz: float) -> Complex | None:
-    """Return the controller at a frequency, from outputs to inputs, without sign; None where none is known."""
-    from ambid.job.closed_loop import loop_of, spectra_of
+def _controllers(estimate: RotorEstimate, rig: Any, whirl: Array) -> dict[float, Complex]:
+    """Return the controller at whirl frequencies by speed, both in rad/s, (n, n_u, n_y), without sign: of the records
+    at each, or of the rig; empty where none is known.
+    """
+    from ambid.job.closed_loop import controller_of, plant_of, spectra_of
     from ambid.rotor.synchronous import separate
 
-    spectra, speed, of = None, estimate.speed, estimate.plant
-    if estimate.used:
-        speeds = [abs(float(str(r["speed"]))) for r in estimate.records]
-        spectra = spectra_of(separate(estimate.used[int(np.argmax(speeds))], of, speed).record, of, speed)
-    try:
-        loop = loop_of(estimate, rig, float(str(estimate.record["rate_hz"])), spectra, speed)
-    except EstimationError:
-        return None
-    return np.asarray(loop.at(np.array([frequency_hz])).K[0])
+    found: dict[float, Complex] = {}
+    rate, of, hz = float(str(estimate.record["rate_hz"])), estimate.plant, whirl / (2.0 * np.pi)
+    for record, used in zip(estimate.records, estimate.used or (None,) * len(estimate.records), strict=True):
+        speed = float(str(record["speed"])) if used is not None else estimate.speed
+        spectra = None if used is None else spectra_of(separate(used, of, speed).record, of, speed)
+        try:
+            controller = controller_of(plant_of(estimate, rate, speed), rig, spectra)
+        except EstimationError:
+            continue
+        if controller.source == "rig":
+            return {abs(estimate.speed): controller.response(hz)[0]}
+        found[abs(speed)] = controller.response(hz)[0]
+    return found
 
 
-def _stiffness(estimate: RotorEstimate, K: Complex | None, frequency_hz: float, j: int) -> complex:
-    """Return -f/x of one axis at a frequency, as if its sensors stood at the magnet.
+def _stiffness(estimate: RotorEstimate, K: Complex, whirl: Array, j: int) -> Complex:
+    """Return -f/x of one axis over frequency in rad/s, as if its sensors stood at the magnet.
 
     i = -(K_x late + k_i s) x/(R + L s + K_i late) of a coil, f = k_i a/(s + a) i - k_x x.
     """
     theta, plant, axis = estimate.numbers, estimate.plant, estimate.plant.axes[j]
-    s = 2j * np.pi * frequency_hz
+    s = 1j * whirl
     k_i, k_x = theta[f"{axis}.k_i"], theta[f"{axis}.k_x"]
     pull = k_i * (theta["a"] / (s + theta["a"]) if "a" in plant.extras else 1.0)
-    if K is None:
-        return complex(k_x)
     rate = float(str(estimate.record["rate_hz"]))
     delay = estimate.delay.get(plant.inputs[j])
     samples = 0.0 if delay is None else delay.samples + delay.fraction
     late = np.exp(-s * (samples + 0.5 * (plant.drive(j) != "current")) / rate)
     rows = [k for k, (of, _) in enumerate(plant.sensors) if of == j]
-    by_position = complex(K[j, rows].sum()) * late
+    by_position = K[:, j, rows].sum(axis=1) * late
     if plant.drive(j) == "voltage":
         row = plant.outputs.index(f"{axis}_current")
-        ratio = (by_position + k_i * s) / (theta[f"{axis}.R"] + theta[f"{axis}.L"] * s + complex(K[j, row]) * late)
+        ratio = (by_position + k_i * s) / (theta[f"{axis}.R"] + theta[f"{axis}.L"] * s + K[:, j, row] * late)
     elif plant.drive(j) == "command":
         pole = theta[f"{axis}.amplifier_pole"]
         ratio = theta[f"{axis}.amplifier_gain"] * pole / (s + pole) * by_position
     else:
         ratio = by_position
-    return complex(k_x + pull * ratio)
+    return np.asarray(k_x + pull * ratio)
