@@ -1,12 +1,13 @@
 """Any file of numbers: what `init` drafts of it identifies the same bearing, or one question says what is missing."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.job import drafting, identify, info
+from ambid.job import drafting, identify, info, simulate
 from ambid.job.drafting import draft
 from ambid.record import read_record
 from ambid.rig import load_rig
@@ -162,3 +163,58 @@ def test_a_hidden_sheet_is_not_read_before_one_that_is_shown(tmp_path):
     book.save(tmp_path / "r.xlsx")
     assert read_record(tmp_path / "r.xlsx").n_samples == 20
     assert read_record(tmp_path / "r.xlsx", layout={"sheet": "old"}).n_samples == 40
+
+
+@pytest.fixture(scope="module")
+def open_loop():
+    """A rotor whose current looks as much like a position to the coil's equation as its position does."""
+    found = simulate("thesis", duration=0.5, seed=3)
+    return SimpleNamespace(
+        t=np.arange(found.n_samples) / found.rate_hz,
+        **{key: found[role].values for key, role in (("u", "voltage"), ("i", "current"), ("x", "position"))},
+    )
+
+
+@pytest.mark.parametrize("order", ["uix", "xiu", "iux"])
+def test_columns_without_a_header_are_told_in_any_order(tmp_path, open_loop, order):
+    np.savetxt(tmp_path / "bare.txt", np.column_stack([open_loop.t, *(getattr(open_loop, key) for key in order)]))
+    ranked = draft(tmp_path / "bare.txt").guess.ranked
+    for key, role in (("u", "voltage"), ("i", "current"), ("x", "position")):
+        assert ranked[role][0].channel.name == f"column {order.index(key) + 2}"
+
+
+def table(path, s, columns, names="voltage [V],current [A],position [m]"):
+    np.savetxt(path, np.column_stack([s.t, *columns]), delimiter=",", header=f"time [s],{names}", comments="")
+
+
+def test_swapped_columns_are_told_and_the_answer_is_taken(tmp_path, record, open_loop):
+    for s in (record, open_loop):
+        table(tmp_path / "s.csv", s, (s.u, s.x, s.i))
+        with pytest.raises(AmbidError, match="look swapped: 'position' is what the voltage drives") as asked:
+            draft(tmp_path / "s.csv")
+        assert "\n" not in str(asked.value)
+        assert draft(tmp_path / "s.csv", columns={"current": "current"}, first=True)
+        table(tmp_path / "right.csv", s, (s.u, s.i, s.x))
+        assert draft(tmp_path / "right.csv").guess.question == ""
+    made = draft(tmp_path / "s.csv", columns={"current": "position [A]", "position": "current [m]"})
+    (tmp_path / "rig.toml").write_text(made.text, encoding="utf-8")
+    one, two = identify(tmp_path / "s.csv", tmp_path / "rig.toml"), identify(tmp_path / "right.csv")
+    assert one["k_i"].value == pytest.approx(two["k_i"].value, rel=1e-6)
+
+
+def test_a_position_that_never_changes_is_told_to_make_a_coil(tmp_path, record):
+    table(tmp_path / "held.csv", record, (record.u, record.i, np.full_like(record.x, 1e-4)))
+    made = draft(tmp_path / "held.csv")
+    assert 'model  = "coil"' in made.text
+    assert any("model: a coil, because the position does not move" in note for note in made.guess.notes)
+
+
+def test_columns_that_nothing_tells_are_asked_for_without_a_trial(tmp_path, record, monkeypatch):
+    def trial(*_):
+        raise AssertionError("a trial fit")
+
+    monkeypatch.setattr(drafting, "_trial", trial)
+    monkeypatch.setattr(drafting, "bearing_of", lambda *_: 0.4)
+    np.savetxt(tmp_path / "bare.txt", np.column_stack([record.t, record.x, record.i, record.u]))
+    with pytest.raises(AmbidError, match="which column is what"):
+        draft(tmp_path / "bare.txt")

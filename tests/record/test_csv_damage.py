@@ -61,6 +61,10 @@ CASES = {
         text([f"{k * 10},{k},{k}" for k in range(20)], "time,voltage [V],position [mm]"),
         ["row 1", "'time'", "rises by 10 a row", "time [s]"],
     ),
+    "whole numbers, in ms or us": (
+        text([f"{k * 2},{k},{k}" for k in range(20)], "time,voltage [V],position [mm]"),
+        ["ms (500 Hz) or us (500000 Hz)", "layout={'time_unit': 's'}"],
+    ),
     "time in s or ms": (
         text([f"{k / 100},{k},{k}" for k in range(20)], "time,voltage [V],position [mm]"),
         ["s (100 Hz) or ms (100000 Hz)", "layout={'time_unit': 's'}"],

@@ -5,6 +5,7 @@ import pytest
 
 from ambid.errors import RecordError
 from ambid.record import read_record
+from ambid.record.clock import dates
 
 TIME, VOLTAGE, POSITION = np.arange(20) * 1e-3, 0.5 * np.arange(20), 1234.5 * np.arange(20)
 HEAD = ["time [s]", "voltage [V]", "position [mm]"]
@@ -175,3 +176,41 @@ def test_a_temperature_called_t_is_not_the_time_where_another_column_is(tmp_path
     path.write_text("Zeit [s],T,u [V]\n" + "".join(f"{k / 1000},{20 + k % 2},{k % 5}\n" for k in range(12)))
     record = read_record(path)
     assert (record.rate_hz, record.names) == (1000.0, ("T", "u"))
+
+
+@pytest.mark.parametrize(
+    ("line", "rate"),
+    [
+        ("Sample rate (kHz): 10", 10_000.0), ("Sampling rate: 10 000 Hz", 10_000.0), ("Rate: 10\u202f000 Hz", 10_000.0),
+        ("Abtastrate: 10'000 Hz", 10_000.0), ("Sample rate: 20 kS/s", 20_000.0), ("Sample rate: 20000 Sa/s", 20_000.0),
+        ("fs = 20kHz", 20_000.0), ("Sample rate: 20k", None), ("Abtastrate: 10.000 Hz", None), ("Rate: 10", None),
+    ],
+)  # fmt: skip
+def test_a_rate_above_the_table_is_read_or_asked_for(tmp_path, line, rate):
+    path = tmp_path / "r.csv"
+    path.write_text(text([line, HEAD[1:]], columns=(VOLTAGE, POSITION)), encoding="utf-8")
+    if rate is None:
+        with pytest.raises(RecordError, match="rate_hz"):
+            read_record(path)
+    else:
+        assert read_record(path).rate_hz == rate
+
+
+@pytest.mark.parametrize(
+    "stamp",
+    [
+        "12/31/2025 1:{:02d}:{:05.2f} PM", "31.12.2025 13:{:02d}:{:05.2f}", "31/12/25 13:{:02d}:{:05.2f}",
+        "31-12-2025 13:{:02d}:{:05.2f}", "2025/12/31 13:{:02d}:{:05.2f}", "2025-12-31T13:{:02d}:{:05.2f}Z",
+    ],
+)  # fmt: skip
+def test_dates_of_any_country_are_time(stamp):
+    stamps = [stamp.format(2, 3.0 + k / 10) for k in range(5)]
+    for texts in (stamps, [x.replace(".", ",") if x.count(".") == 1 else x for x in stamps]):
+        np.testing.assert_allclose(dates(texts), np.arange(5) / 10, atol=1e-9)
+
+
+def test_midnight_changes_the_day_and_nothing_else_does():
+    np.testing.assert_array_equal(dates(["12/31/2025 11:59:59 PM", "1/1/2026 12:00:00 AM"]), [0.0, 1.0])
+    for texts in (["31.12.2025 13:00:00", "2.1.2026 13:00:01"], ["31.12.2025 13:00:00", "31.12.2025 1:00:00 PM"],
+                  ["31.12.2025 25:00:00", "31.12.2025 25:00:01"], ["1.2.3"], ["31.12.2025 13:00:00", "x"]):  # fmt: skip
+        assert dates(texts) is None

@@ -22,7 +22,7 @@ from ambid.record.record import Channel
 from ambid.record.words import label_of, quantities, unit_or_none, unit_within
 from ambid.rig import read_bench
 from ambid.rig.draft import axes_of, draft_rig, model_of
-from ambid.rig.roles import ROLES, Candidate, close, rank_roles, unit_of
+from ambid.rig.roles import ROLES, Candidate, at_rest, bearing_of, close, rank_roles, swapped, unit_of
 from ambid.settings.caller import setting
 from ambid.settings.calls import of_job
 from ambid.units import UNKNOWN
@@ -35,6 +35,7 @@ _KNOWN = 0.5  # largest relative standard deviation of a parameter whose size co
 _LONGEST_NAME = 200
 _CONTROL = {*map(chr, range(32)), "\x7f"}
 _LOOKED = 20_000  # samples that a trial fit takes
+_SHOWN = 0.5  # how much columns have to be a bearing's before one is tried
 _LIKELY = {
     "voltage": ("V", "mV"),
     "current": ("A", "mA"),
@@ -56,7 +57,11 @@ class Guess:
     def notes(self) -> tuple[str, ...]:
         """Time and units that the record does not say, and what cannot be told, a line each."""
         units = [f"{role}: in [{unit}], because {self.why[role]}" for role, unit in self.units.items()]
-        return (*([f"time: {self.time}"] if self.time else []), *units, *([self.question] if self.question else []))
+        held = ["model: a coil, because the position does not move with it; for the magnet, record a rotor that moves"]
+        return (
+            *([f"time: {self.time}"] if self.time else []), *units, *(held if at_rest(self.ranked) else []),
+            *([self.question] if self.question else []),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,6 +140,13 @@ def guess(
                 f"the {role} may be {names}, which are as likely. Say which: "
                 f"{setting('column', f'{role}=NAME')}, or take the first: {setting('yes')}"
             )
+    if not (question or coil or {"current", "position"} & {*told}) and swapped(record, ranked):
+        i, x = (ranked[role][0].channel.name for role in ("current", "position"))
+        other = " and ".join(setting("column", text) for text in (f"current={x} [A]", f"position={i} [m]"))
+        question = (
+            f"current {i!r} and position {x!r} look swapped: {x!r} is what the voltage drives through a coil, and it "
+            f"moves {i!r}. Say which: {other}, in their units, or confirm it with {setting('column', f'current={i}')}"
+        )
     units = {role: unit for role, (_, unit) in told.items() if unit}
     why = dict.fromkeys(units, "as told")
     if not question:
@@ -264,7 +276,9 @@ def _unit_question(
             "where they are"
         )
     columns = {role: _in_si(c, units.get(role)) for role, c in chosen.items()}
-    found = _trial(record, columns, plant)
+    moves = {"voltage", "current", "position"} == {*chosen}
+    shown = not moves or bearing_of((chosen[role].values for role in ROLES), record.rate_hz) >= _SHOWN
+    found = _trial(record, columns, plant) if shown else None  # where it would take long to fail
     if bare:
         return _of_sizes(found, bare, chosen, units, why)
     return "" if found is None else _contradiction(found, chosen, units)

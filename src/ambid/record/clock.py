@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from operator import itemgetter
 
 import numpy as np
@@ -20,6 +21,11 @@ _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOW, _USUAL, _FAST = 50.0, 500.0, 2e6  # Hz: below the first no bearing is sampled, above the second all are
 _EVEN = 0.05  # part of an interval by which those of a column differ that is time though nothing says so
 _LOOKED = 4096  # rows
+_DAY = 86_400.0  # s
+_STAMP = re.compile(
+    r"(\d{1,4}/\d{1,2}/\d{1,4}|\d{1,2}\.\d{1,2}\.\d{2,4}|\d{1,2}-\d{1,2}-\d{2,4})[T ,]{1,2}"
+    r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d+)?) ?([AaPp][Mm])?"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,15 +108,35 @@ def seconds(
 
 
 def dates(texts: Sequence[str]) -> Array | None:
-    """Return dates or times of day in s from the first on; None where the texts are none."""
+    """Return dates or times of day in s from the first on; None where the texts are none.
+
+    Of a date that is not ISO 8601 only that it changes counts: at midnight, where the time of day falls.
+    """
     day = "1970-01-01T" if re.fullmatch(r"\d{1,2}:\d\d:\d\d([.,]\d+)?", texts[0]) else ""
     if not day and not re.match(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:", texts[0]):
-        return None
+        return _dates_of_a_country(texts)
     try:
         stamps = np.array([day + x.replace(" ", "T").replace(",", ".").rstrip("Z") for x in texts], "datetime64[ns]")
     except ValueError:
         return None
     return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def _dates_of_a_country(texts: Sequence[str]) -> Array | None:
+    """Return stamps such as ``12/31/2025 1:02:03 PM`` and ``31.12.2025 13:02:03,5`` as `dates` does."""
+    rows = [_STAMP.fullmatch(x.strip()) for x in texts] if _STAMP.fullmatch(texts[0].strip()) else [None]
+    found = [m.groups("") for m in rows if m is not None]
+    if len(found) < len(rows) or len({half == "" for *_, half in found}) > 1:
+        return None
+    noon = [int(hour) if half == "" else int(hour) % 12 + 12 * (half.lower() == "pm") for _, hour, _, _, half in found]
+    of_day = np.array([
+        3600.0 * h + 60.0 * int(minute) + float(second.replace(",", "."))
+        for h, (_, _, minute, second, _) in zip(noon, found, strict=True)
+    ])  # fmt: skip
+    falls = np.diff(of_day) < -_DAY / 2.0
+    if of_day.max() >= _DAY or falls.tolist() != [a[0] != b[0] for a, b in pairwise(found)]:
+        return None
+    return np.asarray(np.round(of_day - of_day[0] + _DAY * np.concatenate([[0.0], np.cumsum(falls)]), 9))
 
 
 def unit_words(time: Array, name: str, text: str | None) -> str:
@@ -145,6 +171,8 @@ def _plausible(time: Array) -> list[str]:
     rates = {unit: 1.0 / (period * scale) for unit, scale in _UNITS.items()}
     usual = [unit for unit, rate in rates.items() if _USUAL <= rate <= _FAST]
     slow = [unit for unit, rate in rates.items() if _SLOW < rate < _USUAL]
+    if period >= 1.0:  # no seconds: of milliseconds or microseconds, and of nanoseconds alone
+        return [unit for unit in (*slow, *usual) if unit != "ns"] or usual
     return [*slow, *usual[:1]] if usual else slow
 
 

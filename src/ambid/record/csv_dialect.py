@@ -33,8 +33,8 @@ _PARENTHESES = re.compile(r"(?P<name>.*\S)\s*\((?P<unit>[^()]*)\)")
 _NO_OTHER = re.compile(r"(?:deg ?|°|º)?[CFK]|m?bar|counts?|lsb|digits?|-|a\.?u\.?", re.IGNORECASE)  # units, not places
 _SPACED = re.compile("\\d([' \u00a0\u202f\u2019])\\d")
 _NAMED_NUMBER = re.compile(
-    rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d*[.,]?\d+{_POWER})\s*[,;\t]?\s*"
-    r"(?P<unit>[A-Za-zµμ]{0,3})"
+    rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d{{1,3}}(?:[ '\u00a0\u2009\u202f]\d{{3}})+|"
+    rf"\d*[.,]?\d+{_POWER})\s*[,;\t]?\s*(?P<unit>[A-Za-zµμ]{{0,3}}(?:/s)?)"
 )
 _HEAD = 1 << 14  # bytes in which the words of an encoding are looked for
 _FASTEST = 2e6  # Hz, of a bearing
@@ -345,7 +345,8 @@ def _beside(lines: Sequence[str]) -> dict[str, tuple[float, str | None]]:
     for line in lines:
         match = _NAMED_NUMBER.fullmatch(line.lstrip("#%").strip().rstrip(",;\t "))
         if match and not _thousandfold(**match.groupdict()):
-            pairs[match["name"].strip()] = (float(match["number"].replace(",", ".")), match["unit"] or None)
+            number = re.sub(r"[\s']", "", match["number"]).replace(",", ".")
+            pairs[match["name"].strip()] = (float(number), match["unit"] or None)
     return pairs
 
 

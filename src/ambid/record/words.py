@@ -46,9 +46,9 @@ _INTERVAL = re.compile(
 _UNIT_WORDS = {
     "V": "volt volts", "A": "amp amps ampere amperes", "m": "meter meters metre metres", "s": "sec secs second seconds "
     "sekunde sekunden", "ms": "millisecond milliseconds msec", "us": "microsecond microseconds usec", "N": "newton "
-    "newtons", "Hz": "hertz", "ohm": "ohms", "deg": "degree degrees °", "rad": "radian radians", "rpm": "1/min u/min "
-    "min^-1", "mm": "millimeter millimeters", "um": "micron microns micrometer micrometers", "mV": "millivolt",
-    "mA": "milliampere milliamps",
+    "newtons", "Hz": "hertz s/s sa/s sps samples/s", "kHz": "ks/s ksa/s ksps", "ohm": "ohms", "deg": "degree degrees °",
+    "rad": "radian radians", "rpm": "1/min u/min min^-1", "mm": "millimeter millimeters", "um": "micron microns "
+    "micrometer micrometers", "mV": "millivolt", "mA": "milliampere milliamps",
 }  # fmt: skip
 _SYMBOLS = {word: unit for unit, words in _UNIT_WORDS.items() for word in words.split()}
 _LABEL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")

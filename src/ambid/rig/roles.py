@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ _WINDOWS = (1, 4, 16, 64)  # samples that the coil's equation is integrated over
 _DELAYS = (0, 1, 2, 4)  # samples by which the voltage may act later
 _CANDIDATES = 4  # of a role that are looked at, the best by name
 _SHOWN = 0.2  # part of what the other terms leave that a term has to explain before its sign counts
+_MOTIONS = (1, 2, 4, 8, 16, 32)  # quarters of the windows, in samples, that the motion is seen through
 _LIKE = 0.8  # how much a column that neither unit nor name gives away has to do what its role does
 
 
@@ -79,11 +80,51 @@ def rank_roles(record: Record, told: Mapping[str, str] | None = None) -> Mapping
     likely = {role: [c for c in cs if c.signal > 0][:_CANDIDATES] for role, cs in ranked.items()}
     coils = _coils(record, likely)
     coherent = _coherences(record, {c.channel.name for cs in likely.values() for c in cs})
+    moved = {
+        (i.channel.name, x.channel.name): motion_of(i.channel.values[:_LOOKED], x.channel.values[:_LOOKED])
+        for i, x in itertools.product(likely["current"], likely["position"])
+        if i.channel.name != x.channel.name and max(i.named, x.named) <= _UNNAMED
+    }
+    coherent |= {(x, i): max(coherent.get((x, i), 0.0), part) for (i, x), part in moved.items()}
     judged = {role: [_judged(c, coils, coherent, likely, record) for c in cs] for role, cs in ranked.items()}
-    return _distinct({
+    kept = {
         role: sorted((c for c in cs if c.named > _UNNAMED or c.fits >= _LIKE), key=lambda c: -c.score)
         for role, cs in judged.items()
-    })  # fmt: skip
+    }
+    return _distinct(kept, moved)
+
+
+def motion_of(i: Array, x: Array) -> float:
+    """Return the part that a current explains of what a position does beyond its own stiffness and damping, 0 to 1:
+    x'' = a i - b x - c x', through the smooth windows at which it explains most.
+    """
+    most = 0.0
+    if x.size < _LEAST or not (np.ptp(i) > 0 and np.ptp(x) > 0):
+        return most
+    i, x = i / np.ptp(i), x / np.ptp(x)
+    for quarter in _MOTIONS:
+        window = np.hanning(4 * quarter + 3)[1:-1] / (2.0 * quarter + 1.0)
+        slope, bend = np.convolve(window, [0.5, 0.0, -0.5]), np.convolve(window, [1.0, -2.0, 1.0])
+        terms = [np.convolve(s, k, "valid") for s, k in ((x, np.pad(window, 1)), (x, slope), (i, np.pad(window, 1)))]
+        seen = np.column_stack([*terms, np.convolve(x, bend, "valid")])
+        R = np.asarray(np.linalg.qr(seen - seen.mean(axis=0), mode="r"))
+        both = R[2, 3] ** 2 + R[3, 3] ** 2  # what position and velocity leave, of which the current leaves the latter
+        most = max(most, float(R[2, 3] ** 2 / both) if both > 0 else 0.0)
+    return most
+
+
+def bearing_of(columns: Iterable[Array], rate_hz: float) -> float:
+    """Return how much three columns are a bearing's voltage, current and position, 0 to 1: coil and motion."""
+    v, i, x = (column[:_LOOKED] for column in columns)
+    return min(coil_of(v, i, x, rate_hz).share, motion_of(i, x)) if x.size >= _LEAST else 1.0
+
+
+def swapped(record: Record, ranked: Mapping[str, Sequence[Candidate]]) -> bool:
+    """Whether current and position do what the other should, and neither what it should."""
+    if not all(ranked[role] for role in ROLES):
+        return False
+    v, i, x = (ranked[role][0].channel.values for role in ROLES)
+    return bearing_of((v, i, x), record.rate_hz) < _SHOWN and bearing_of((v, x, i), record.rate_hz) >= _LIKE
 
 
 def close(ranked: Sequence[Candidate]) -> bool:
@@ -221,7 +262,7 @@ def _judged(
         pairs = [(coherent[name, s], s) for s in sources if (name, s) in coherent]
         if pairs:
             fits, source = max(pairs)
-            words.append(f"{100.0 * fits:.0f} % of its power is coherent with {source}")
+            words.append(f"{100.0 * fits:.0f} % of what it does follows {source}")
     else:
         own = [pair for pair in coils if name == pair[c.role == "current"]]
         best = max(own, key=lambda pair: coils[pair].share, default=None)
@@ -256,8 +297,17 @@ def _coil_words(coil: Coil, pair: tuple[str, str], record: Record) -> str:
     return words + (", one of the two reversed" if coil.reversed else "")
 
 
-def _distinct(ranked: Mapping[str, Sequence[Candidate]]) -> Mapping[str, Sequence[Candidate]]:
-    """Give a column that two roles want to the one for which all scores together are best."""
+def _distinct(
+    ranked: Mapping[str, Sequence[Candidate]], moved: Mapping[tuple[str, str], float]
+) -> Mapping[str, Sequence[Candidate]]:
+    """Give a column that two roles want to the one for which all scores together are best, with how much the current
+    moves the position.
+    """
+
+    def rating(choice: Sequence[Candidate | None]) -> float:
+        _, i, x = ("" if c is None else c.channel.name for c in choice)
+        return math.fsum(c.score for c in choice if c) + _UNNAMED * moved.get((i, x), 0.0)
+
     first = [[*cs[:_CANDIDATES], None] for cs in ranked.values()]
     best = max(
         (
@@ -265,7 +315,7 @@ def _distinct(ranked: Mapping[str, Sequence[Candidate]]) -> Mapping[str, Sequenc
             for choice in itertools.product(*first)
             if len({c.channel.name for c in choice if c}) == sum(c is not None for c in choice)
         ),
-        key=lambda choice: sum(c.score for c in choice if c),
+        key=rating,
     )
     roles = {}
     for (role, cs), top in zip(ranked.items(), best, strict=True):
