@@ -30,7 +30,7 @@ from ambid.rig.rig import (
     optional_roles,
     role_units,
 )
-from ambid.rig.rotor import modes_of, planes_of, rotor_of, shaft_of, si_of, speed_of, turning_of, unit_of
+from ambid.rig.rotor import modes_of, operation_of, planes_of, rotor_of, shaft_of, si_of, speed_of, turning_of, unit_of
 from ambid.settings.caller import path_of
 from ambid.units import UNKNOWN, parse_unit
 
@@ -170,7 +170,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         plant = rotor_of(file, where) if file.bearings else model(file.model)
     except ModelError as error:
         raise RigError(f"{where}: {error}") from None
-    key = next((x for x in ("modes", "speed", "shaft", "unbalance") if getattr(file, x)), None)
+    key = next((x for x in ("modes", "speed", "shaft", "unbalance", "operation") if getattr(file, x)), None)
     if key and not file.bearings:
         raise RigError(
             f"{where}: {key} is given, but no [bearings.X]; only a rotor on many axes has it. Add its bearings"
@@ -193,6 +193,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         shaft=None if file.shaft is None else shaft_of(file.shaft, parameters, where),
         unbalance=unbalance,
         runout=runout,
+        operation=None if file.operation is None else operation_of(file.operation, where),
         magnet=None if file.magnet is None else magnet_of(file.magnet, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
         loop=_loop(file.loop, where) if file.loop else None,

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -20,7 +20,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import Material, Shaft
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
-from ambid.rig.rotor import RigModes
+from ambid.rig.rotor import Operation, RigModes
 from ambid.settings.caller import setting
 
 TRIP_SHARE = 0.9
@@ -245,6 +245,8 @@ class Rig:
         Its drawing, for expected modes, start values and simulation.
     unbalance, runout : tuple of Turning
         What turns with it, for simulation.
+    operation : Operation or None
+        Speeds and clearances that its machine is accepted for.
     operating_point : Mapping[str, float]
         Declared values of roles, SI; a role that is absent takes the mean of the record.
     loop : Loop or None
@@ -274,6 +276,7 @@ class Rig:
     shaft: Shaft | None = None
     unbalance: tuple[Turning, ...] = ()
     runout: tuple[Turning, ...] = ()
+    operation: Operation | None = None
     operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     loop: Loop | None = None
     limits: Limits | None = None
@@ -558,6 +561,11 @@ def _rotor_lines(rig: Rig, rotor: RotorModel) -> list[str]:
     for u in rig.unbalance:
         entries = {**_quantity(u.value, "kg m"), "phase": u.phase, "z": _quantity(u.z, "m")}
         lines += ["", f"[unbalance.{u.name}]", *toml_lines(entries)]
+    if (o := rig.operation) is not None:
+        values = {f.name: getattr(o, f.name) for f in fields(o)}
+        units = {name: "rad/s" if "speed" in name else "m" for name in values}
+        given = {name: _quantity(x, units[name]) for name, x in values.items() if x is not None}
+        lines += ["", "[operation]", *toml_lines(given)]
     return lines + (["", *_shaft_lines(rig.shaft)] if rig.shaft else [])
 
 

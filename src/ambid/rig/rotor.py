@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         BearingEntry,
         DiscEntry,
         MaterialEntry,
+        OperationEntry,
         ParameterEntry,
         PlaneEntry,
         QuantityEntry,
@@ -49,6 +50,16 @@ class RigModes:
     # for simulation, under the names of the rotor's model: ``mode1.omega``, ``mode1.zeta``, ``mode1.A.z`` …,
     # ``mode1.unbalance.<name>``, ``gyro.01`` …; SI
     numbers: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Operation:
+    """What a machine is accepted for, ``[operation]``."""
+
+    maximum_speed: float | None = None  # ends of the range of continuous operation, rad/s
+    minimum_speed: float | None = None
+    touch_down: float | None = None  # radial clearance in the touch-down bearings, the smallest to the stator, m
+    axial_touch_down: float | None = None  # along the shaft
 
 
 def rotor_of(file: RigFile, where: str) -> RotorModel:
@@ -216,6 +227,21 @@ def speed_of(entry: QuantityEntry | None, where: str) -> float:
     if not abs(speed) <= _FASTEST:
         raise RigError(f"{where}: speed is {speed:.4g} rad/s; no rotor is faster than {_FASTEST:g} rad/s. Correct it")
     return speed
+
+
+def operation_of(entry: OperationEntry, where: str) -> Operation:
+    """Return what a machine is accepted for; `where`: the file, for messages."""
+    place = f"{where}: operation"
+    sizes = {name: getattr(entry, name) for name in ("touch_down", "axial_touch_down")}
+    speeds = {name: getattr(entry, name) for name in ("maximum_speed", "minimum_speed")}
+    values = {name: si_of(x, "m", f"{place}.{name}") for name, x in sizes.items() if x is not None}
+    values |= {name: speed_of(x, f"{place}.{name}") for name, x in speeds.items() if x is not None}
+    wrong = next((name for name, x in values.items() if x <= 0.0), None)
+    if wrong is not None:
+        raise RigError(f"{place}.{wrong} is {values[wrong]:g}; it must be positive. Correct it")
+    if values.get("minimum_speed", 0.0) > values.get("maximum_speed", math.inf):
+        raise RigError(f"{place}.minimum_speed is above maximum_speed. Correct one")
+    return Operation(**values)
 
 
 def shaft_of(entry: ShaftEntry, parameters: Sequence[Parameter], where: str) -> Shaft:

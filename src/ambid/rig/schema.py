@@ -234,6 +234,15 @@ class BearingEntry(_Entry):
     z_sensor_sd: SpreadEntry | None = None
 
 
+class OperationEntry(_Entry):
+    """``[operation]``: what a machine is accepted for; see :class:`ambid.rig.rig.Operation`."""
+
+    maximum_speed: QuantityEntry | None = None
+    minimum_speed: QuantityEntry | None = None
+    touch_down: QuantityEntry | None = None
+    axial_touch_down: QuantityEntry | None = None
+
+
 class ModesEntry(_Entry):
     """``[modes]``: how many bending modes a rotor has, and where they may be; for simulation all their numbers."""
 
@@ -298,6 +307,7 @@ class RigFile(_Entry):
     shaft: ShaftEntry | None = None
     speed: QuantityEntry | None = None
     unbalance: dict[AxisName, UnbalanceEntry] = Field(default_factory=dict)
+    operation: OperationEntry | None = None
     operating_point: Literal["auto"] | dict[str, Literal["auto"] | QuantityEntry] = "auto"
     loop: LoopEntry | None = None
     noise: NoiseEntry | None = None
