@@ -1,8 +1,8 @@
 """Physical parameters of active magnetic bearings, with honest uncertainty.
 
-``ambid.identify(record, rig)`` is the main job; `fit`, `frf`, `compare`, `margins`, `simulate`, `track`, `validate`,
-`info` and `acquire` are the functions that the commands of these names call, and `load` reads what they wrote. Rooms
-and names are imported when they are first used, so that ``import ambid`` costs next to nothing.
+``ambid.identify(record, rig)`` is the main job; `fit`, `frf`, `compare`, `margins`, `accept`, `simulate`, `track`,
+`validate`, `info` and `acquire` are the functions that the commands of these names call, and `load` reads what they
+wrote. Rooms and names are imported when they are first used, so that ``import ambid`` costs next to nothing.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ambid.estimation.estimate import Estimate as Estimate
     from ambid.estimation.estimate import estimate_from_json as estimate_from_json
     from ambid.fleet.run import fleet as fleet
+    from ambid.job import accept as accept
     from ambid.job import acquire as acquire
     from ambid.job import compare as compare
     from ambid.job import demo as demo

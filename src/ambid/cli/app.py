@@ -30,6 +30,7 @@ DOORS = {
         "identify": "identify physical parameters, with uncertainty, from a record",
         "validate": "check an estimate or a fit on another record",
         "margins": "show the margins of the loop of a record",
+        "accept": "make the acceptance report of a machine",
         "track": "track parameters through a record, as on-line",
         "design": "design the next experiment or the controller on a model",
         "history": "show a bearing over time, from a ledger",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
+    from ambid.control.acceptance import Acceptance as Acceptance
     from ambid.control.design import Design as Design
     from ambid.control.experiment import Experiment as Experiment
     from ambid.control.margins import Margins as Margins

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
+    from ambid.job.acceptance import accept as accept
     from ambid.job.acquiring import acquire as acquire
     from ambid.job.commissioning import commission as commission
     from ambid.job.controller_design import design_controller as design_controller

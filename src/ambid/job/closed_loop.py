@@ -89,7 +89,12 @@ def plant_of(estimate: Numbers, rate_hz: float, speed: float = 0.0) -> Plant:
         raise EstimationError(
             f"model {of.name!r} has no position: there is no position loop, and no margin of it. Use model 'one-axis'"
         )
-    return Plant.of(of, theta, estimate.delay, rate_hz, estimate.covariance_names, estimate.covariance)
+    names, covariance = estimate.covariance_names, estimate.covariance
+    if isinstance(estimate, RotorEstimate):  # a rotor at rest has no gyroscopic terms
+        own = {p.name for p in of.parameters}
+        names = tuple(n for n in names if n in own or n.endswith(".delay"))
+        covariance = estimate.covariance_of(names)
+    return Plant.of(of, theta, estimate.delay, rate_hz, names, covariance)
 
 
 def controller_of(plant: Plant, rig: Rig, spectra: PeriodSpectra | None) -> Controller:

@@ -131,7 +131,7 @@ def margins(
     clock.lap("identify")
     say("margins")
     with one_thread():
-        found = _margins(known, bench, used)
+        found, _ = margins_and_loop(known, bench, used)
     clock.lap("margins")
     return replace(found, timing_s=clock.laps, rig=rig_entry(bench))
 
@@ -150,7 +150,7 @@ def margins_beside(estimate: Numbers, used: Any) -> Margins | None:
         k = max(range(len(taken)), key=lambda m: abs(float(str(estimate.records[m]["speed"]))))
     try:
         with one_thread():
-            return _margins(estimate, rig_of(estimate, "the estimate"), taken[k])
+            return margins_and_loop(estimate, rig_of(estimate, "the estimate"), taken[k])[0]
     except AmbidError:
         return None
 
@@ -185,12 +185,18 @@ def given(estimate: Any, rig: RigSource | None) -> tuple[Numbers, Rig]:
     return known, bench
 
 
-def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
+def margins_and_loop(
+    estimate: Numbers, rig: Rig, bench: Record | None, at_speed: float | None = None
+) -> tuple[Margins, ClosedLoop]:
+    """Return the margins of an estimate's loop as a record shows it, None: as the rig says, and the loop itself;
+    `at_speed`: that of a rotor in the record, rad/s, where it is there already.
+    """
     clean, speed = bench, estimate.speed if isinstance(estimate, RotorEstimate) else 0.0
     if bench is not None and isinstance(estimate, RotorEstimate):
         from ambid.rotor.synchronous import separate
 
-        apart = separate(bench, estimate.plant.at_speed(0.0 if rig.rotor is None else rig.rotor.speed))
+        model_speed = 0.0 if rig.rotor is None else rig.rotor.speed
+        apart = separate(bench, estimate.plant.at_speed(model_speed), at_speed)
         clean, speed = apart.record, apart.speed
     plant = model(estimate.model) if isinstance(estimate, Estimate) else estimate.plant
     spectra = None if clean is None else spectra_of(clean, plant, speed)
@@ -209,7 +215,7 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
     noise, whose = noise_by_name(estimate, rig, loop.plant)
     room = _room(estimate, rig, loop)
     machine = _machine(estimate, rig)
-    return Margins(
+    result = Margins(
         status=estimate.status, model=estimate.model, of="estimate" if bench is None else "record", record=record,
         speed=speed,
         controller={"source": of.source, "order": list(of.orders), "misfit": of.misfit},
@@ -220,6 +226,7 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
         room=room_by_axis(loop, noise, room, machine), noise=whose,
         vibration=None if machine is None else _vibration(loop, rig, machine, room),
     )  # fmt: skip
+    return result, loop
 
 
 def noise_by_name(

@@ -383,6 +383,7 @@ _KINDS: Mapping[str, Kind] = {
     "Validation": Kind(describe=_validation, write=partial(_fields, "ambid.validation/1")),
     "Modal": _whole("response.modal_document", "modes"),
     "Margins": _whole("margins.margins_document", "margins"),
+    "Acceptance": _whole("acceptance.acceptance_document", "acceptance"),
     "Experiment": _whole("experiment.experiment_document", "experiment"),
     "Design": _whole("design.design_document", "design"),
     "Inspection": _whole("record.inspection_document", "inspection", _record),

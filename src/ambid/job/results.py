@@ -154,6 +154,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet_simulate"),
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
     "ambid.agreement/1": _whole("validation.agreement", "Agreement", "compare"),
+    "ambid.acceptance/1": _whole("control.acceptance", "Acceptance", "accept"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_record", "Validation", "validate"),

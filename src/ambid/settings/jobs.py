@@ -123,6 +123,12 @@ _JOBS = (
         reference={"help": "Column of the excitation, of one axis.", "shown": "as the rig says", "many": False},
     ),
     declare(
+        "accept",
+        "records rig estimate speed_rpm from_s to_s rate_hz gaps layout json plot report strict",
+        records={"help": "Records of one rotor: at rest and at speed with excitation, run-ups, coast-downs."},
+        estimate={"help": "Machine, as 'ambid identify @json' wrote it.", "shown": "identified from the records"},
+    ),
+    declare(
         "history",
         "ledger bearing every rename redate remove record undo alarms acknowledge until who why export publish json "
         "plot report strict",

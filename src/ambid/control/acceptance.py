@@ -1,0 +1,196 @@
+"""What is found where a machine is accepted: items of the standards, each with what was measured, its limit and its
+outcome; ``ambid.acceptance/1``. And the dynamic stiffness of magnetic bearings, by their controller and coils.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import ClosedLoop
+from ambid.control.limits import LIMITS
+from ambid.control.margins import Margins
+from ambid.estimation.estimate import Check, Judged
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.estimate import RotorEstimate
+
+Outcome = Literal["passed", "doubt", "failed", "reported", "missing"]
+"""Doubt: the 95 % interval holds the limit; reported: there is no limit; missing: these records cannot tell."""
+Part = Literal["sensitivity", "vibration", "bearings", "critical", "unbalance", "collocation", "capacity", "touch_down"]
+PARTS: Mapping[Part, str] = MappingProxyType(
+    {
+        "sensitivity": "Sensitivity of every axis (ISO 14839-3)",
+        "vibration": "Vibration within the clearance (ISO 14839-2)",
+        "bearings": "Bearings: force by displacement, closed-loop stiffness and damping",
+        "critical": "Critical speeds: amplification factors and separation margins",
+        "unbalance": "Unbalance, and its response at the limit",
+        "collocation": "Sensors and magnets along the bending modes",
+        "capacity": "Static load and capacity",
+        "touch_down": "Touch-down clearance",
+    }
+)
+_DERIVED = 1e-4  # relative step of a parameter, by which the spread of a stiffness is found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Item:
+    """One line of the report."""
+
+    part: Part
+    what: str
+    outcome: Outcome
+    value: float | None = None  # SI
+    sd: float = 0.0  # 0: it is not known
+    unit: str = ""
+    limit: float | None = None  # in `unit`
+    limits: str = ""  # which of `LIMITS` that is
+    words: str = ""  # zone, place; of a missing item the record that would show it
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether a stored text has the figure of its limit."""
+        return not self.limits or bool(LIMITS[self.limits].looked_up)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stiffness:
+    """Dynamic stiffness of the bearings: force on the rotor by its displacement, as a function of frequency."""
+
+    frequency_hz: Array  # (n,)
+    real: Mapping[str, Array]  # by axis, N/m: stiffness
+    imaginary: Mapping[str, Array]  # N/m: damping times angular frequency
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Acceptance(Judged):
+    """A machine by the standards that it is accepted by, as its records show it.
+
+    Attributes
+    ----------
+    status : {"converged", "stalled", "failed"}
+        Of the estimate of the machine.
+    model : str
+    record : Mapping[str, object]
+        The first record.
+    records : tuple of Mapping
+        Of each its ``kind`` ("rest", "speed", "run-up"), ``speed`` in rad/s, file, SHA-256, samples, rate.
+    items : tuple of Item
+    checks : Mapping[str, Check]
+        One a part with limits, ``complete``, ``estimate``.
+    margins : Mapping[str, Margins]
+        Of the loop of each steady record.
+    estimate : RotorEstimate
+        The machine.
+    stiffness : Stiffness or None
+        Of the bearings; None where no controller is known.
+    clearance : float or None
+        Radial clearance in the touch-down bearings, m.
+    speeds : tuple of float
+        Minimum and maximum continuous speed, rad/s.
+    calibration : Mapping[str, str]
+        What the rig says of each channel's calibration.
+    warnings : tuple of str
+    timing_s : Mapping[str, float]
+    rig : Mapping[str, object]
+    """
+
+    status: Literal["converged", "stalled", "failed"]
+    model: str
+    record: Mapping[str, object]
+    records: tuple[Mapping[str, object], ...]
+    items: tuple[Item, ...]
+    checks: Mapping[str, Check]
+    margins: Mapping[str, Margins]
+    estimate: RotorEstimate
+    stiffness: Stiffness | None
+    clearance: float | None
+    speeds: tuple[float, float]
+    calibration: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    def of(self, part: Part) -> list[Item]:
+        """Return the items of a part.
+
+        Parameters
+        ----------
+        part : str
+            One of `PARTS`.
+
+        Returns
+        -------
+        list of Item
+        """
+        return [item for item in self.items if item.part == part]
+
+
+def outcome_of(value: float, sd: float, limit: float) -> Outcome:
+    """Judge a number that is to lie below its limit."""
+    if value + 1.96 * sd < limit:
+        return "passed"
+    return "doubt" if value - 1.96 * sd < limit else "failed"
+
+
+def dynamic_stiffness(loop: ClosedLoop) -> Complex:
+    """Return -f/x of each axis of a rotor, (n, n_axes) in N/m: its magnet's force by a displacement of the shaft that
+    its magnet and sensors see alike, through controller, hold, delay, coil (with the voltage that motion induces), eddy
+    pole and the magnet's own k_x.
+    """
+    plant, model = loop.plant, loop.plant.model
+    assert isinstance(model, RotorModel)
+    s, theta, n = 2j * np.pi * loop.frequency_hz, plant.theta, len(model.axes)
+    of = {q: np.array([theta.get(f"{axis}.{q}", 0.0) for axis in model.axes]) for q in ("k_i", "k_x", "R", "L")}
+    turn = s / plant.rate_hz
+    acting = np.exp(-turn[:, None] * plant.delays)  # an input that is held over a sample, and late
+    acting = np.where(np.array(model.held), acting * ((1.0 - np.exp(-turn)) / turn)[:, None], acting)
+    through, induced = np.ones((s.size, n), dtype=complex), np.zeros((s.size, n), dtype=complex)
+    for j, axis in enumerate(model.axes):
+        if model.drive(j) == "voltage":
+            through[:, j] = 1.0 / (of["R"][j] + s * of["L"][j])
+            induced[:, j] = through[:, j] * s * of["k_i"][j]
+        elif model.drive(j) == "command":
+            pole = theta[f"{axis}.amplifier_pole"]
+            through[:, j] = theta[f"{axis}.amplifier_gain"] * pole / (s + pole)
+    read = np.zeros((s.size, len(model.outputs), n), dtype=complex)
+    for k, (j, _) in enumerate(model.sensors):
+        axis = model.axes[j]
+        read[:, k, j] = theta.get(f"{axis}.gain", 1.0)
+        if f"{axis}.sensor_pole" in model.extras:
+            read[:, k, j] *= theta[f"{axis}.sensor_pole"] / (s + theta[f"{axis}.sensor_pole"])
+    back = np.zeros((len(model.outputs), n))
+    for k, j in enumerate(model.coils):
+        back[len(model.sensors) + k, j] = 1.0
+    forward = (through * acting)[:, :, None] * loop.K
+    coil = np.einsum("kj,ji->kji", induced, np.eye(n))
+    current = np.linalg.solve(np.eye(n) + forward @ back, forward @ read + coil)
+    late = theta["a"] / (s + theta["a"]) if "a" in model.extras else np.ones(s.size)
+    return np.asarray(late[:, None] * of["k_i"] * np.diagonal(current, axis1=1, axis2=2) + of["k_x"])
+
+
+def stiffness_sd(loop: ClosedLoop) -> Complex:
+    """Return the standard deviations of the real and, as imaginary part, of the imaginary part of the dynamic
+    stiffness, by the covariance of the plant; the controller counts as known.
+    """
+    plant = loop.plant
+    if plant.covariance is None:
+        return np.zeros((loop.frequency_hz.size, len(plant.axes)), dtype=complex)
+    middle, slopes = dynamic_stiffness(loop), []
+    for name in plant.names:
+        theta, delays, step = dict(plant.theta), plant.delays.copy(), _DERIVED
+        if name.endswith(".delay"):
+            delays[plant.model.inputs.index(name.removesuffix(".delay"))] += step
+        else:
+            step *= abs(theta[name]) or 1.0
+            theta[name] += step
+        moved = replace(loop, plant=replace(plant, theta=theta, delays=delays))
+        slopes.append((dynamic_stiffness(moved) - middle) / step)
+    J = np.array(slopes)
+    variance = [np.einsum("pkj,pq,qkj->kj", x, plant.covariance, x) for x in (J.real, J.imag)]
+    real, imaginary = (np.sqrt(np.maximum(v, 0.0)) for v in variance)
+    return np.asarray(real + 1j * imaginary)

@@ -1,0 +1,66 @@
+"""Limits of the standards by which a machine on magnetic bearings is accepted, each with its source, its edition, and
+the text in which its figure was looked up. None of these texts is the standard itself: a limit without one is shown as
+unconfirmed, and all are to be checked against the standard.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from ambid.control.zones import STANDARD
+
+API = "API 617, 9th edition (2022)"
+_ROSS = "ROSS, report.py, after API RP 684 (2nd edition) SP6.8.2"
+_TUTORIAL = "ROSS, tutorial on magnetic bearings"
+_LATERAL = "a published calculation after API 617 (8th edition) 6.8.2 and 6.9"
+_MICROMETRES, _SPEED = 25.4, 12_000.0  # of the limit of vibration: peak to peak at a speed in 1/min
+CLEARANCE_SHARE = 0.75
+"""Of the smallest diametral clearance, up to which the scaled response may come, peak to peak."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limit:
+    """A limit of a standard."""
+
+    figure: str  # as a formula, or as numbers
+    standard: str  # with its edition
+    looked_up: str = ""  # where the figure was found; empty: it is unconfirmed
+
+    @property
+    def source(self) -> str:
+        """Standard and edition, and whether the figure is confirmed."""
+        return f"{self.standard}; {f'figure as in {self.looked_up}' if self.looked_up else 'unconfirmed'}"
+
+
+LIMITS: Mapping[str, Limit] = MappingProxyType(
+    {
+        "sensitivity": Limit(figure="A to 3, B to 4", standard=STANDARD, looked_up=_TUTORIAL),
+        "sensitivity C": Limit(figure="C to 5", standard=STANDARD),
+        "displacement": Limit(figure="A to 0.3, B to 0.4, C to 0.5 of the clearance", standard="ISO 14839-2:2004"),
+        "separation": Limit(
+            figure="above: 10 + 17 (1 - 1/(AF - 1.5)) %, at most 26 %; below: 17 (1 - 1/(AF - 1.5)) %, at most 16 %; "
+            "none where AF < 2.5", standard=API, looked_up=f"{_ROSS}.10",
+        ),
+        "amplification": Limit(figure="AF < 2.5: critically damped", standard=API, looked_up=f"{_ROSS}.10"),
+        "vibration": Limit(
+            figure="25.4 um (12 000/N)^(1/2), peak to peak, N in 1/min", standard=API, looked_up=f"{_ROSS}.11"
+        ),
+        "unbalance": Limit(figure="6350 W/N g mm, W in kg on the journal", standard=API, looked_up=_LATERAL),
+        "scaled": Limit(
+            figure="75 % of the smallest diametral clearance, peak to peak", standard=API, looked_up=_LATERAL
+        ),
+    }
+)  # fmt: skip
+
+
+def vibration_limit(speed: float) -> float:
+    """Return the largest vibration, peak to peak in m, at a maximum continuous speed in rad/s."""
+    return 1e-6 * _MICROMETRES * math.sqrt(_SPEED / (speed * 30.0 / math.pi))
+
+
+def residual_unbalance(load: float, speed: float) -> float:
+    """Return the largest unbalance, kg m, of a plane whose journal carries a load in kg, at a speed in rad/s."""
+    return 6350e-6 * load / (speed * 30.0 / math.pi)
