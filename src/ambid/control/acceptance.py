@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -34,6 +34,7 @@ PARTS: Mapping[Part, str] = MappingProxyType(
         "touch_down": "Touch-down clearance",
     }
 )
+_LINES = 1500  # frequencies up to 1.2 times the highest speed
 _DERIVED = 1e-4  # relative step of a parameter, by which the spread of a stiffness is found
 
 
@@ -66,6 +67,24 @@ class Stiffness:
     imaginary: Mapping[str, Array]  # N/m: damping times angular frequency
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Run:
+    """A run-up or coast-down: what turns with the rotor over its speed."""
+
+    record: str
+    speed: Array  # (n,), rad/s, in the order of time
+    amplitude: Mapping[str, Complex]  # by position, (n,), m: x(t) = Re a exp(j angle)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WhirlLines:
+    """Where the loop as identified resonates over the speed of rotation."""
+
+    speed: Array  # (n,), rad/s
+    forward: tuple[Array, ...]  # by speed: frequencies of the peaks of its response to a force that turns, rad/s
+    backward: tuple[Array, ...]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Acceptance(Judged):
     """A machine by the standards that it is accepted by, as its records show it.
@@ -88,6 +107,9 @@ class Acceptance(Judged):
         The machine.
     stiffness : Stiffness or None
         Of the bearings; None where no controller is known.
+    runs : tuple of Run
+    whirl : WhirlLines or None
+        None where no controller is known.
     clearance : float or None
         Radial clearance in the touch-down bearings, m.
     speeds : tuple of float
@@ -108,6 +130,8 @@ class Acceptance(Judged):
     margins: Mapping[str, Margins]
     estimate: RotorEstimate
     stiffness: Stiffness | None
+    runs: tuple[Run, ...]
+    whirl: WhirlLines | None
     clearance: float | None
     speeds: tuple[float, float]
     calibration: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
@@ -171,6 +195,37 @@ def dynamic_stiffness(loop: ClosedLoop) -> Complex:
     current = np.linalg.solve(np.eye(n) + forward @ back, forward @ read + coil)
     late = theta["a"] / (s + theta["a"]) if "a" in model.extras else np.ones(s.size)
     return np.asarray(late[:, None] * of["k_i"] * np.diagonal(current, axis1=1, axis2=2) + of["k_x"])
+
+
+def whirl_lines(loop: ClosedLoop, speeds: Array) -> WhirlLines:
+    """Return where the compliance of the loop peaks at each speed in rad/s, to forces in the radial bearings that turn
+    with the shaft or against it.
+    """
+    model, n_y, n_d = loop.plant.model, len(loop.plant.model.outputs), loop.plant.space.E.shape[1]
+    assert isinstance(model, RotorModel)
+    top = 1.2 * float(speeds[-1]) / (2.0 * np.pi)
+    f = np.linspace(top / _LINES, top, _LINES)
+    turn = np.array([(1.0, -1j, 0.0)[plane] for _, plane in model.placed])
+    radial = np.flatnonzero(turn)
+    lines: tuple[list[Array], list[Array]] = ([], [])
+    for speed in speeds:
+        plant = replace(loop.plant, model=model.at_speed(float(speed)))
+        moved = ClosedLoop(plant=plant, controller=loop.controller, frequency_hz=f).motions
+        G = moved[:, n_y + radial][:, :, n_d + radial]
+        for way, peaks in zip((turn[radial], turn[radial].conj()), lines, strict=True):
+            circular = np.conj(way)[None, :, None] * G * way
+            size = np.linalg.norm(_by_bearing(circular, model, radial), ord=2, axis=(1, 2))
+            k = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1
+            bend = 0.5 * (size[k - 1] - size[k + 1]) / (size[k - 1] - 2.0 * size[k] + size[k + 1])
+            peaks.append(2.0 * np.pi * (f[k] + bend * (f[1] - f[0])))
+    return WhirlLines(speed=speeds, forward=tuple(lines[0]), backward=tuple(lines[1]))
+
+
+def _by_bearing(G: Complex, model: RotorModel, radial: Any) -> Complex:
+    """Return the response of bearings, (n, n_bearings, n_bearings), to a turning force in each: means over the axes."""
+    names = [model.placed[j][0].name for j in radial]
+    own = np.array([[1.0 * (name == b) for name in names] for b in dict.fromkeys(names)])
+    return np.asarray(own @ G @ own.T / 2.0)
 
 
 def stiffness_sd(loop: ClosedLoop) -> Complex:

@@ -17,6 +17,8 @@ _ROSS = "ROSS, report.py, after API RP 684 (2nd edition) SP6.8.2"
 _TUTORIAL = "ROSS, tutorial on magnetic bearings"
 _LATERAL = "a published calculation after API 617 (8th edition) 6.8.2 and 6.9"
 _MICROMETRES, _SPEED = 25.4, 12_000.0  # of the limit of vibration: peak to peak at a speed in 1/min
+AMPLIFICATION = 2.5
+"""Factor below which a response counts as critically damped."""
 CLEARANCE_SHARE = 0.75
 """Of the smallest diametral clearance, up to which the scaled response may come, peak to peak."""
 
@@ -32,28 +34,29 @@ class Limit:
     @property
     def source(self) -> str:
         """Standard and edition, and whether the figure is confirmed."""
-        return f"{self.standard}; {f'figure as in {self.looked_up}' if self.looked_up else 'unconfirmed'}"
+        seen = f"confirmed by {self.looked_up}, not by its own text" if self.looked_up else "unconfirmed"
+        return f"{self.standard}; {seen}"
 
 
-LIMITS: Mapping[str, Limit] = MappingProxyType(
-    {
-        "sensitivity": Limit(figure="A to 3, B to 4", standard=STANDARD, looked_up=_TUTORIAL),
-        "sensitivity C": Limit(figure="C to 5", standard=STANDARD),
-        "displacement": Limit(figure="A to 0.3, B to 0.4, C to 0.5 of the clearance", standard="ISO 14839-2:2004"),
-        "separation": Limit(
-            figure="above: 10 + 17 (1 - 1/(AF - 1.5)) %, at most 26 %; below: 17 (1 - 1/(AF - 1.5)) %, at most 16 %; "
-            "none where AF < 2.5", standard=API, looked_up=f"{_ROSS}.10",
-        ),
-        "amplification": Limit(figure="AF < 2.5: critically damped", standard=API, looked_up=f"{_ROSS}.10"),
-        "vibration": Limit(
-            figure="25.4 um (12 000/N)^(1/2), peak to peak, N in 1/min", standard=API, looked_up=f"{_ROSS}.11"
-        ),
-        "unbalance": Limit(figure="6350 W/N g mm, W in kg on the journal", standard=API, looked_up=_LATERAL),
-        "scaled": Limit(
-            figure="75 % of the smallest diametral clearance, peak to peak", standard=API, looked_up=_LATERAL
-        ),
-    }
+_LIMITS = (
+    ("sensitivity", "peak of the sensitivity in zone A to 3, in zone B to 4 (9.54 and 12.04 dB)", STANDARD, _TUTORIAL),
+    ("sensitivity C", "in zone C to 5 (13.98 dB)", STANDARD, ""),
+    (
+        "displacement", "largest displacement in zone A to 0.3, in B to 0.4, in C to 0.5 of the smallest clearance",
+        "ISO 14839-2:2004", "",
+    ),
+    ("amplification", "an amplification factor (AF) below 2.5 is critically damped", API, f"{_ROSS}.10"),
+    (
+        "separation", "separation above the range of operation 10 + 17 (1 - 1/(AF - 1.5)) %, at most 26 %, below it "
+        "17 (1 - 1/(AF - 1.5)) %, at most 16 %; none of a critically damped one", API, f"{_ROSS}.10",
+    ),
+    ("vibration", "synchronous vibration 25.4 um (12 000/N)^(1/2), peak to peak, N in 1/min", API, f"{_ROSS}.11"),
+    ("unbalance", "unbalance 6350 W/N g mm, W in kg on the journal, N in 1/min", API, _LATERAL),
+    ("scaled", "response scaled to that limit 75 % of the smallest diametral clearance, peak to peak", API, _LATERAL),
 )  # fmt: skip
+LIMITS: Mapping[str, Limit] = MappingProxyType(
+    {name: Limit(figure=figure, standard=standard, looked_up=text) for name, figure, standard, text in _LIMITS}
+)
 
 
 def vibration_limit(speed: float) -> float:

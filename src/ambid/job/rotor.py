@@ -268,11 +268,10 @@ def _synchronous(
     ]
     if not turned:
         return {}
-    clearance = None if rig.limits is None else min(abs(x) for x in rig.limits.position)
     read = {b.name: [b.sensor_parameter(k) for k in range(len(b.z_sensors))] for b in estimate.plant.bearings}
     runout = {place: r.value * np.exp(1j * r.phase) for r in rig.runout for place in read[r.name]}
     machine = Machine.of(estimate, balance_planes(estimate, rig))
-    return balance_rotor(machine, turned, runout=runout, clearance=clearance)
+    return balance_rotor(machine, turned, runout=runout, clearance=rig.clearance)
 
 
 def balance_planes(estimate: RotorEstimate, rig: Rig) -> dict[str, tuple[float, ...]]:

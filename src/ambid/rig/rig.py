@@ -292,6 +292,16 @@ class Rig:
         return model(self.model) if self.rotor is None else self.rotor
 
     @property
+    def clearance(self) -> float | None:
+        """Radial clearance in the touch-down bearings, m: that of ``[operation]``, else the smaller end of
+        ``loop.limits.position``; None where neither is given.
+        """
+        if self.operation is not None and self.operation.touch_down is not None:
+            return self.operation.touch_down
+        least = math.inf if self.limits is None else min(abs(x) for x in self.limits.position)
+        return least if math.isfinite(least) else None
+
+    @property
     def rate_hz(self) -> float | None:
         """Sampling rate that the rig gives: of its records, else of the law of its loop, else of its controller."""
         law = None if self.loop is None else self.loop.law
