@@ -39,6 +39,7 @@ VERBS = {
     "history": ("history", "A", "--ledger", "l.db", "--json"),
     "ledger backup": ("ledger", "backup", "l.db", "-o"),
     "ledger restore": ("ledger", "restore", "l.db", "l2.db", "-o"),
+    "accept": ("accept", "r.csv", "--rig", "rig.toml", "--json"),
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),
     "design controller": ("design", "controller", "e.json", "--rig", "rig.toml", "--out"),
