@@ -5,14 +5,19 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import ambid
-from ambid.control.acceptance import PARTS
+from ambid.control.acceptance import PARTS, dynamic_stiffness
+from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.controller import controller_of_loop
 from ambid.errors import EstimationError
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
 from ambid.rig.rotor import Operation
+from ambid.simulation.rotor_bench import RotorBench
+from ambid.simulation.variation import Schedule
 
 RPM = math.pi / 30.0
 OPERATION = Operation(maximum_speed=30_000.0 * RPM, minimum_speed=25_000.0 * RPM, touch_down=0.2e-3)
@@ -49,12 +54,18 @@ def test_sensitivities_are_those_of_margins(spindle):
 
 
 def test_stiffness_and_damping_are_those_of_the_true_bearings(spindle):
-    """By the formula of a current loop without delay, which the controller is but for a sample: signs and sizes."""
-    at = {x.what.split(",")[0]: x for x in spindle.accepted.of("bearings") if "axis ax at" in x.what}
-    assert at["stiffness"].value > 0.0
-    assert at["damping"].value > 0.0
-    for x in at.values():
-        assert 0.0 < x.sd < 0.05 * x.value
+    """Of every axis, at the maximum speed, by the numbers that made the records and the loop of the bench."""
+    theta = {p.name: p.value for p in spindle.rig.parameters} | dict(preset("spindle").parameters)
+    model, rate, top = spindle.rig.rotor, spindle.rig.rate_hz, OPERATION.maximum_speed
+    plant = Plant(model=model, theta=theta, delays=np.ones(5), rate_hz=rate)
+    controller = controller_of_loop(spindle.rig.loop, model, rate)
+    loop = ClosedLoop(plant=plant, controller=controller, frequency_hz=np.array([top / (2.0 * math.pi)]))
+    of_bearings = {x.what: x for x in spindle.accepted.of("bearings")}
+    for axis, D in zip(model.axes, dynamic_stiffness(loop)[0], strict=True):
+        for what, true in (("stiffness", D.real), ("damping", D.imag / top)):
+            x = of_bearings[f"{what}, axis {axis}"]
+            assert 0.0 < x.sd < 0.05 * abs(x.value)
+            assert abs(x.value - true) < 4.0 * x.sd
 
 
 def test_the_displacement_is_within_the_clearance(spindle):
@@ -110,3 +121,44 @@ def test_one_axis_is_refused():
     rig = rig_of_preset(preset("rmit-axis"))
     with pytest.raises(EstimationError, match="of one axis"):
         ambid.accept(ambid.simulate("rmit-axis", duration=0.2, seed=1), rig)
+
+
+@pytest.fixture(scope="module")
+def run_up(spindle):
+    """The acceptance for 15,000 rpm by a run-up to 20,000, and by the rotor moved along its stops."""
+    slower = replace(spindle.rig, operation=replace(OPERATION, maximum_speed=15_000.0 * RPM, minimum_speed=None))
+    bench = RotorBench.of(slower, None, None)
+    ramp = Schedule.ramp(500.0 * RPM, 20_000.0 * RPM, 0.0, 2.0)
+    records = [bench.run_up(ramp, 40_000, seed=5).record, stops(spindle, 0.19e-3)]
+    return SimpleNamespace(accepted=ambid.accept(records, slower, estimate=spindle.estimate))
+
+
+def stops(spindle, clearance):
+    """A record at rest in which every axis goes round its clearance, and comes to stand at it."""
+    record = spindle.records[0]
+    angle = 2.0 * np.pi * np.linspace(0.0, 5.0, record.n_samples)
+    way = {"x": np.cos(angle), "y": np.sin(angle), "z": np.sin(angle)}
+
+    def moved(channel):
+        if channel.name.endswith("_position"):
+            return replace(channel, values=clearance * way[channel.name[1]])
+        return replace(channel, values=np.zeros(record.n_samples)) if channel.name.endswith("_reference") else channel
+
+    return replace(record, channels=tuple(moved(c) for c in record.channels))
+
+
+def test_a_run_up_shows_critical_speeds_and_the_scaled_response(run_up):
+    assert [r["kind"] for r in run_up.accepted.records] == ["run-up", "stops"]
+    assert run_up.accepted.records[0]["speed"] == pytest.approx(20_000.0 * RPM, rel=1e-3)
+    assert not [x for x in run_up.accepted.items if x.outcome == "missing" and x.part in ("critical", "touch_down")]
+    scaled = [x for x in run_up.accepted.of("unbalance") if "scaled" in x.what]
+    assert {x.outcome for x in scaled} == {"passed"}
+    assert scaled[0].limit == pytest.approx(1.5 * 0.2e-3)
+    vibration = [x for x in run_up.accepted.of("unbalance") if "vibration" in x.what]
+    assert [x.limit for x in vibration] == [pytest.approx(25.4e-6 * math.sqrt(12_000.0 / 15_000.0))] * 4
+
+
+def test_the_stops_show_the_clearance(run_up):
+    clear = [x for x in run_up.accepted.of("touch_down") if x.what.startswith("clearance")]
+    assert [x.what for x in clear] == ["clearance, bearing A", "clearance, bearing B", "clearance, bearing T"]
+    assert [x.value for x in clear] == [pytest.approx(0.19e-3, rel=5e-3)] * 3

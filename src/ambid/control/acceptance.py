@@ -15,9 +15,12 @@ from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop
 from ambid.control.limits import LIMITS
 from ambid.control.margins import Margins
+from ambid.control.zones import LONG_TERM, Grade
 from ambid.estimation.estimate import Check, Judged
+from ambid.estimation.result import NORMAL_95
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.whirl_points import WhirlPoint
 
 Outcome = Literal["passed", "doubt", "failed", "reported", "missing"]
 """Doubt: the 95 % interval holds the limit; reported: there is no limit; missing: these records cannot tell."""
@@ -97,7 +100,7 @@ class Acceptance(Judged):
     record : Mapping[str, object]
         The first record.
     records : tuple of Mapping
-        Of each its ``kind`` ("rest", "speed", "run-up"), ``speed`` in rad/s, file, SHA-256, samples, rate.
+        Of each its ``kind`` ("rest", "speed", "run-up", "stops"), ``speed`` in rad/s, file, SHA-256, samples, rate.
     items : tuple of Item
     checks : Mapping[str, Check]
         One a part with limits, ``complete``, ``estimate``.
@@ -108,6 +111,8 @@ class Acceptance(Judged):
     stiffness : Stiffness or None
         Of the bearings; None where no controller is known.
     runs : tuple of Run
+    points : tuple of WhirlPoint
+        Modes that noise shows in records at rest and at speed.
     whirl : WhirlLines or None
         None where no controller is known.
     clearance : float or None
@@ -131,6 +136,7 @@ class Acceptance(Judged):
     estimate: RotorEstimate
     stiffness: Stiffness | None
     runs: tuple[Run, ...]
+    points: tuple[WhirlPoint, ...]
     whirl: WhirlLines | None
     clearance: float | None
     speeds: tuple[float, float]
@@ -156,9 +162,14 @@ class Acceptance(Judged):
 
 def outcome_of(value: float, sd: float, limit: float) -> Outcome:
     """Judge a number that is to lie below its limit."""
-    if value + 1.96 * sd < limit:
+    if value + NORMAL_95 * sd < limit:
         return "passed"
-    return "doubt" if value - 1.96 * sd < limit else "failed"
+    return "doubt" if value - NORMAL_95 * sd < limit else "failed"
+
+
+def outcome_of_zone(grade: Grade) -> Outcome:
+    """Judge a number by its zone: A or B is for operation without limit of time."""
+    return "passed" if grade.worst in LONG_TERM else "doubt" if grade.letters[0] in LONG_TERM else "failed"
 
 
 def dynamic_stiffness(loop: ClosedLoop) -> Complex:

@@ -36,6 +36,7 @@ from ambid.record import GapPolicy
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.passage import Passage
+from ambid.rotor.whirl_points import whirl_points
 from ambid.settings.caller import setting
 from ambid.settings.calls import of_job
 
@@ -107,15 +108,16 @@ def accept(
         )
     benches = benches_of(read_records(sources_of(records), bench, speed_rpm, say, **reading), bench.rotor)
     clock.lap("read")
-    steady = [b for b in benches if b.kind != "run-up"]
     if of_machine is None:
-        if not steady:
+        steady = [b for b in benches if b.kind in ("rest", "speed")]
+        chosen = [b for b in steady if b.apart is not None and b.apart.excitation is not None] or steady[:1]
+        if not chosen:
             raise EstimationError(
-                "the machine is identified from a record at rest or at a speed, with excitation; these are run-ups "
-                f"alone. Give one, or {setting('estimate')}"
+                "the machine is identified from a record at rest or at a speed, with excitation; none of these is one. "
+                f"Give one, or {setting('estimate')}"
             )
-        speeds = [b.speed * _RPM for b in steady]
-        of_machine = identify_rotor([b.record for b in steady], bench, speed_rpm=speeds, tick=say)
+        speeds = [b.speed * _RPM for b in chosen]
+        of_machine = identify_rotor([b.record for b in chosen], bench, speed_rpm=speeds, tick=say)
     clock.lap("identify")
     say("items")
     with one_thread():
@@ -127,7 +129,8 @@ def accept(
 def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
     e, loops = machine.estimate, dict[str, tuple[Margins, ClosedLoop]]()
     warnings = list[str]()
-    for b in machine.steady:
+    excited = [b for b in machine.steady if b.apart is not None and b.apart.excitation is not None]
+    for b in excited or machine.steady:
         try:
             loops[b.name] = margins_and_loop(e, machine.rig, b.record, b.speed)
         except AmbidError as error:
@@ -150,6 +153,7 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
         items=tuple(items), checks=_checks(machine, items), margins={name: m for name, (m, _) in loops.items()},
         stiffness=None if loop is None else _curves(machine, loop), estimate=e, clearance=machine.rig.clearance,
         runs=tuple(_run(name, p) for name, p in machine.passages.items()),
+        points=tuple(x for b in machine.steady for x in whirl_points(b.record, e.plant.at_speed(b.speed))),
         whirl=None if loop is None else whirl_lines(loop, np.linspace(0.0, _BEYOND * machine.fastest, _SPEEDS)),
         speeds=machine.speeds, calibration=_calibration(machine.rig), warnings=tuple(warnings),
         rig=rig_entry(machine.rig),

@@ -12,29 +12,32 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.control.acceptance import (
     Item,
+    Outcome,
     Part,
     dynamic_stiffness,
     outcome_of,
+    outcome_of_zone,
     stiffness_sd,
 )
 from ambid.control.closed import ClosedLoop
 from ambid.control.limits import AMPLIFICATION, CLEARANCE_SHARE, residual_unbalance, vibration_limit
 from ambid.control.margins import Margins
-from ambid.control.zones import DISPLACEMENT, LONG_TERM, ZONES, Grade
-from ambid.errors import EstimationError
+from ambid.control.zones import DISPLACEMENT, ZONES, Grade
 from ambid.estimation.result import NORMAL_95
 from ambid.job.rotor import RotorRecord
 from ambid.physics.loop import UNLIMITED
-from ambid.physics.rotor_model import RotorModel
+from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rig.rotor import Operation
 from ambid.rotor.estimate import RotorEstimate
-from ambid.rotor.passage import Passage, changes_speed, track_passage, turning_of
+from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of
 from ambid.rotor.resonance import Resonances, resonances, scaled_to_limit, separations
 from ambid.rotor.synchronous import Separated, separate
 
 _RPM = 30.0 / math.pi
+_SECTORS, _ROUND = 8, 0.5  # directions; the least reach over the largest, of a rotor that is moved along its stops
+_STOP, _STAYS = 0.95, 0.3  # quantile of a direction that is its stop; share of the samples near the stops
 _NEAR = 0.03  # of the maximum speed, within which a record is one at it
 
 
@@ -44,7 +47,7 @@ class Bench:
 
     record: Record  # channels named by role
     name: str
-    kind: str  # "rest", "speed" or "run-up"
+    kind: str  # "rest", "speed", "run-up" or "stops"
     speed: float  # rad/s; of a run-up the highest
     apart: Separated | None  # its synchronous part; None of a run-up
 
@@ -60,13 +63,31 @@ def benches_of(readings: Sequence[RotorRecord], model: RotorModel) -> list[Bench
 
 
 def _bench(read: RotorRecord, model: RotorModel) -> Bench:
-    """Tell a run-up by the range of its speed from a record at one speed or at rest."""
-    if changes_speed(read.bench):
-        top = float(np.max(np.abs(turning_of(read.bench).speed(read.bench.rate_hz))))
-        return Bench(record=read.bench, name=read.name, kind="run-up", speed=top, apart=None)
-    apart = separate(read.bench, model, read.speed)
-    kind = "rest" if apart.response is None else "speed"
-    return Bench(record=read.bench, name=read.name, kind=kind, speed=apart.speed, apart=apart)
+    """Tell a run-up by the range of its speed, and a rotor moved along its stops by how far it comes all around."""
+    record = read.bench
+    if changes_speed(record):
+        top = float(np.max(np.abs(turning_of(record).speed(record.rate_hz))))
+        return Bench(record=record, name=read.name, kind="run-up", speed=top, apart=None)
+    apart = separate(record, model, read.speed)
+    kind = "speed" if apart.response is not None else "rest"
+    if kind == "rest" and apart.excitation is None and all(_reach(record, b.axes) for b in model.bearings):
+        kind = "stops"
+    return Bench(record=record, name=read.name, kind=kind, speed=apart.speed, apart=apart)
+
+
+def _reach(record: Record, axes: Sequence[str]) -> float:
+    """Return how far a rotor comes in the direction in which it comes least far, m; 0 where it does not stop there for
+    some samples in every direction.
+    """
+    y = np.column_stack([record[f"{axis}_position"].values for axis in axes])
+    if len(axes) == 1:
+        y = np.column_stack([y, np.zeros(y.shape[0])])
+        sector, n = (y[:, 0] < 0.0).astype(int), 2
+    else:
+        sector, n = (np.angle(y @ [1.0, 1j]) / (2.0 * np.pi) * _SECTORS).round().astype(int) % _SECTORS, _SECTORS
+    size = np.linalg.norm(y, axis=1)
+    tops = [np.quantile(size[sector == k], _STOP) if np.any(sector == k) else 0.0 for k in range(n)]
+    return float(min(tops)) if min(tops) > _ROUND * max(tops) and np.mean(size > 0.8 * min(tops)) > _STAYS else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +101,7 @@ class Machine:
     @property
     def steady(self) -> list[Bench]:
         """Records at rest or at one speed."""
-        return [b for b in self.benches if b.kind != "run-up"]
+        return [b for b in self.benches if b.kind in ("rest", "speed")]
 
     @cached_property
     def passages(self) -> dict[str, Passage]:
@@ -115,6 +136,18 @@ class Machine:
         """Return the radial clearance in the touch-down bearings, or that along the shaft, m."""
         own = self.operation.axial_touch_down
         return own if axial and own is not None else self.rig.clearance
+
+    def largest(self, b: Bench, bearing: Bearing) -> float:
+        """Return the largest displacement in a bearing in any sample, m."""
+        return next(x.largest for x in displacements(b.record, self.estimate.plant) if x.plane == bearing.name)
+
+    def load(self, plane: str) -> float | None:
+        """Return the mass that the bearing in a plane carries, kg; None: it is no bearing's plane, or not of two."""
+        n, radial = self.estimate.numbers, [f"{b.name}.z" for b in self.estimate.plant.bearings if not b.axial]
+        if len(radial) != 2 or plane not in radial:
+            return None
+        other = radial[1 - radial.index(plane)]
+        return abs(n["m"] * (n["z_cg"] - n[other]) / (n[plane] - n[other]))
 
     def gain_sd(self, role: str) -> float:
         """Return how well the gain of a channel is known."""
@@ -151,284 +184,242 @@ def items_of(machine: Machine, margins: Mapping[str, Margins], loop: ClosedLoop 
     ]  # fmt: skip
 
 
+def _item(
+    part: Part, what: str, value: float, sd: float, unit: str, words: str = "", *, outcome: Outcome = "reported",
+    limit: float | None = None, limits: str = "",
+) -> Item:  # fmt: skip
+    return Item(
+        part=part, what=what, value=float(value), sd=float(sd), unit=unit, words=words, outcome=outcome, limit=limit,
+        limits=limits,
+    )  # fmt: skip
+
+
+def _missing(part: Part, what: str, record: str) -> Item:
+    """Return an item that these records cannot show, and which would."""
+    return Item(part=part, what=what, outcome="missing", words=f"{record} would")
+
+
 def _sensitivity(margins: Mapping[str, Margins]) -> Iterator[Item]:
-    part: Part = "sensitivity"
     for name, m in margins.items():
         for axis, s in m.sensitivity.items():
             zone = s.rating
             hz = s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
-            sure = zone.worst in LONG_TERM
-            yield Item(
-                part=part, what=f"axis {axis}, {name}", value=zone.peak_db, sd=zone.sd_db, unit="dB",
-                outcome="passed" if sure else "doubt" if zone.letters[0] in LONG_TERM else "failed",
-                limit=20.0 * math.log10(ZONES[1][0]), limits=part,
-                words=f"zone {zone.words}, {zone.source}, at {hz:.4g} Hz",
+            yield _item(
+                "sensitivity", f"axis {axis}, {name}", zone.peak_db, zone.sd_db, "dB",
+                f"zone {zone.words}, {zone.source}, at {hz:.4g} Hz", outcome=outcome_of_zone(zone),
+                limit=20.0 * math.log10(ZONES[1][0]), limits="sensitivity",
             )  # fmt: skip
     if not margins:
-        yield Item(
-            part=part, what="all axes", outcome="missing",
-            words="a record at rest or at a speed with an excitation logged as reference of each axis would",
-        )  # fmt: skip
+        record = "a record at rest or at a speed with an excitation logged as reference of each axis"
+        yield _missing("sensitivity", "all axes", record)
     elif not any(m.speed for m in margins.values()):
-        yield Item(
-            part=part, what="at speed", outcome="missing",
-            words="a record at the maximum speed with excitation would",
-        )  # fmt: skip
+        yield _missing("sensitivity", "at speed", "a record at the maximum speed with excitation")
 
 
 def _vibration(machine: Machine) -> Iterator[Item]:
     """Judge the largest displacement from the centre in each bearing, in each record at a speed."""
-    part: Part = "vibration"
-    turning = [b for b in machine.benches if b.kind != "rest"]
+    turning = [b for b in machine.benches if b.kind in ("speed", "run-up")]
     for b in turning:
         for bearing in machine.estimate.plant.bearings:
-            clearance = machine.clearance(axial=bearing.axial)
-            what = f"bearing {bearing.name}, {b.name}"
+            clearance, what = machine.clearance(axial=bearing.axial), f"bearing {bearing.name}, {b.name}"
             if clearance is None:
-                place = "operation.axial_touch_down" if bearing.axial else "operation.touch_down"
-                yield Item(part=part, what=what, outcome="missing", words=f"a rig with {place} would")
+                key = "operation.axial_touch_down" if bearing.axial else "operation.touch_down"
+                yield _missing("vibration", what, f"a rig with {key}")
                 continue
-            value, sd, how = _displacement(machine, b, bearing.axes)
+            value, sd, how = _displacement(machine, b, bearing)
             grade = Grade.of_displacement(value / clearance, sd / clearance)
-            sure = grade.worst in LONG_TERM
-            yield Item(
-                part=part, what=what, value=value, sd=sd, unit="m", limit=DISPLACEMENT[1][0] * clearance,
-                limits="displacement",
-                outcome="reported" if b.kind == "run-up" else
-                "passed" if sure else "doubt" if grade.letters[0] in LONG_TERM else "failed",
-                words=f"zone {grade.words}, {100.0 * value / clearance:.3g} % of the clearance, {how}",
+            yield _item(
+                "vibration", what, value, sd, "m",
+                f"zone {grade.words}, {100.0 * value / clearance:.3g} % of the clearance, {how}",
+                outcome="reported" if b.kind == "run-up" else outcome_of_zone(grade),
+                limit=DISPLACEMENT[1][0] * clearance, limits="displacement",
             )  # fmt: skip
     if not any(b.kind == "speed" for b in turning):
-        words = "a record at the maximum speed would"
-        yield Item(part=part, what="steady operation", outcome="missing", words=words)
+        yield _missing("vibration", "steady operation", "a record at the maximum speed")
 
 
-def _displacement(machine: Machine, b: Bench, axes: Sequence[str]) -> tuple[float, float, str]:
+def _displacement(machine: Machine, b: Bench, bearing: Bearing) -> tuple[float, float, str]:
     """Return the largest displacement from the zero of the sensors, m, with its spread and how it was found: in the
     samples, or, where the record is excited, of the mean and what turns with the rotor.
     """
-    roles = [f"{axis}_position" for axis in axes]
-    samples = np.column_stack([b.record[role].values for role in roles])
+    roles = [f"{axis}_position" for axis in bearing.axes]
     gain = max(machine.gain_sd(role) for role in roles)
     if b.apart is None or b.apart.excitation is None or b.apart.response is None:
-        top = float(np.max(np.linalg.norm(samples, axis=1)))
+        top = machine.largest(b, bearing)
         return top, gain * top, "largest sample"
     r = b.apart.response
-    at = [r.roles.index(role) for role in roles]
-    turn = np.linspace(0.0, 2.0 * np.pi, 720)
-    waves = np.einsum("ko,oj->kj", np.exp(1j * np.outer(turn, r.orders)), r.amplitude[:, at]).real
-    top = float(np.max(np.linalg.norm(samples.mean(axis=0) + waves, axis=1)))
+    at, mean = [r.roles.index(role) for role in roles], [float(b.record[role].values.mean()) for role in roles]
+    turn = np.exp(1j * np.outer(np.linspace(0.0, 2.0 * np.pi, 720), r.orders))
+    top = float(np.max(np.linalg.norm(mean + (turn @ r.amplitude[:, at]).real, axis=1)))
     return top, math.hypot(float(np.linalg.norm(r.sd()[at])), gain * top), "mean and synchronous part"
 
 
 def _bearings(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
-    part: Part = "bearings"
     if loop is None:
-        yield Item(
-            part=part, what="force by displacement", outcome="missing",
-            words="a record with an excitation logged as reference would, or [loop] in the rig",
-        )  # fmt: skip
+        record = "a record with an excitation logged as reference, or [loop] in the rig,"
+        yield _missing("bearings", "force by displacement", record)
         return
-    top = machine.speeds[1]
+    axes, top, G = loop.plant.axes, machine.speeds[1], np.abs(loop.compliance)
     if top:
         at = loop.at(np.array([top / (2.0 * np.pi)]))
-        values, sd = dynamic_stiffness(at)[0], stiffness_sd(at)[0]
-        for j, axis in enumerate(loop.plant.axes):
-            where = f"axis {axis} at {top * _RPM:.5g} 1/min"
-            for what, x, spread, unit in (
-                ("stiffness", values[j].real, sd[j].real, "N/m"),
-                ("damping", values[j].imag / top, sd[j].imag / top, "N s/m"),
-            ):
-                yield Item(
-                    part=part, what=f"{what}, {where}", value=float(x), sd=float(spread), unit=unit, outcome="reported"
-                )
-    G = np.abs(loop.compliance)
-    for j, axis in enumerate(loop.plant.axes):
+        values, sd, where = dynamic_stiffness(at)[0], stiffness_sd(at)[0], f"at {top * _RPM:.5g} 1/min"
+        for axis, x, s in zip(axes, values, sd, strict=True):
+            yield _item("bearings", f"stiffness, axis {axis}", x.real, s.real, "N/m", where)
+            yield _item("bearings", f"damping, axis {axis}", x.imag / top, s.imag / top, "N s/m", where)
+    for j, axis in enumerate(axes):
         k = int(np.argmax(G[:, j]))
-        yield Item(
-            part=part, what=f"least dynamic stiffness of the rotor, axis {axis}", value=float(1.0 / G[k, j]),
-            unit="N/m", outcome="reported", words=f"at {loop.frequency_hz[k]:.4g} Hz, loop closed",
-        )  # fmt: skip
+        words = f"of the rotor in the closed loop, at {loop.frequency_hz[k]:.4g} Hz"
+        yield _item("bearings", f"least dynamic stiffness, axis {axis}", 1.0 / G[k, j], 0.0, "N/m", words)
 
 
 def _critical(machine: Machine) -> Iterator[Item]:
     """Judge the separation of each critical speed from the range of operation, by its amplification factor."""
-    part: Part = "critical"
     if machine.resonances is None:
-        yield Item(
-            part=part, what="critical speeds", outcome="missing",
-            words="a record of a run-up or coast-down with a channel of angle, pulses or speed would",
-        )  # fmt: skip
+        record = "a record of a run-up or coast-down with a channel of angle, pulses or speed"
+        yield _missing("critical", "critical speeds", record)
         return
     top = machine.speeds[1]
     for k, x in enumerate(separations(machine.resonances.resonances, machine.speeds), 1):
-        r, way = x.resonance, ""
-        if r.forward is not None:
-            way = f", {100.0 * r.forward:.0f} % of the motion forward"
-        yield Item(
-            part=part, what=f"critical speed {k}", value=r.speed.value, sd=r.speed.sd, unit="rad/s", outcome="reported",
-            words=f"damping ratio {100.0 * r.damping.value:.3g} %, largest in bearing {r.plane}{way}",
-        )  # fmt: skip
+        r, factor = x.resonance, x.resonance.amplification
+        way = "" if r.forward is None else f", {100.0 * r.forward:.0f} % of the motion forward"
+        words = f"damping ratio {100.0 * r.damping.value:.3g} %, largest in bearing {r.plane}{way}"
+        yield _item("critical", f"critical speed {k}", r.speed.value, r.speed.sd, "rad/s", words)
         how = "by half-power points" if r.half_power else "1/(2 damping ratio)"
-        yield Item(
-            part=part, what=f"amplification factor {k}", value=r.amplification.value, sd=r.amplification.sd, unit="1",
-            limit=AMPLIFICATION, limits="amplification", outcome="reported",
-            words=f"{how}: critically damped, no separation is needed" if r.critically_damped else how,
+        words = f"{how}: critically damped, no separation is needed" if r.critically_damped else how
+        yield _item(
+            "critical", f"amplification factor {k}", factor.value, factor.sd, "1", words,
+            limit=AMPLIFICATION, limits="amplification",
         )  # fmt: skip
-        if r.critically_damped:
-            continue
-        lies = "within the range of operation" if x.actual == 0.0 else "above it" if r.speed.value > top else "below it"
-        fails = x.actual + NORMAL_95 * x.sd < x.required
-        yield Item(
-            part=part, what=f"separation {k}", value=100.0 * x.actual, sd=100.0 * x.sd, unit="%",
-            limit=100.0 * x.required_most, limits="separation",
-            outcome="passed" if x.passed else "failed" if fails else "doubt", words=lies,
-        )  # fmt: skip
+        if not r.critically_damped:
+            place = "within" if x.actual == 0.0 else "above" if r.speed.value > top else "below"
+            fails = x.actual + NORMAL_95 * x.sd < x.required
+            yield _item(
+                "critical", f"separation {k}", 100.0 * x.actual, 100.0 * x.sd, "%", f"{place} the range of operation",
+                outcome="passed" if x.passed else "failed" if fails else "doubt",
+                limit=100.0 * x.required_most, limits="separation",
+            )  # fmt: skip
     fastest = max(float(p.speed.max()) for p in machine.passages.values())
     if not machine.resonances.resonances:
-        yield Item(part=part, what="no critical speed", outcome="reported", words="in the range of the run-ups")
-    if top and fastest < top:
-        words = f"a run-up to the maximum speed, {top * _RPM:.5g} 1/min, would"
-        yield Item(part=part, what="critical speeds up to the maximum", outcome="missing", words=words)
+        yield _item("critical", "speed without a critical one", fastest, 0.0, "rad/s", "highest of the run-ups")
+    if fastest < top:
+        yield _missing("critical", "critical speeds up to the maximum", f"a run-up to {top * _RPM:.5g} 1/min")
 
 
 def _unbalance(machine: Machine) -> Iterator[Item]:
     """Judge the unbalance that is left, and the synchronous vibration at the maximum speed."""
-    part: Part = "unbalance"
     top, s = machine.speeds[1], machine.estimate.synchronous
-    m = machine.estimate.numbers["m"]
     planes = s.get("unbalance", {}).get("planes", {})
-    if planes and all(p["identifiable"] for p in planes.values()):
-        whole = s["unbalance"]["static"]
-        for what, x, load in [("static", whole, m), *((name, p, _load(machine, name)) for name, p in planes.items())]:
+    if top and planes and all(p["identifiable"] for p in planes.values()):
+        whole = ("static", s["unbalance"]["static"], machine.estimate.numbers["m"])
+        for what, x, load in [whole, *((name, p, machine.load(name)) for name, p in planes.items())]:
             limit = None if load is None else residual_unbalance(load, top)
-            yield Item(
-                part=part, what=f"unbalance, {what}", value=x["value"], sd=x["sd"], unit="kg m", limit=limit,
+            outcome = "reported" if limit is None else outcome_of(x["value"], x["sd"], limit)
+            yield _item(
+                "unbalance", f"unbalance, {what}", x["value"], x["sd"], "kg m", outcome=outcome, limit=limit,
                 limits="unbalance" if limit else "",
-                outcome="reported" if limit is None else outcome_of(x["value"], x["sd"], limit),
             )  # fmt: skip
     else:
-        words = s.get("hint") or "a record at a speed with angle or pulses would"
-        yield Item(part=part, what="unbalance by plane", outcome="missing", words=str(words))
+        seen = f" ({s['hint']})" if s.get("hint") else ""
+        yield _missing("unbalance", f"unbalance by plane{seen}", "records at two speeds with angle or pulses")
     yield from _scaled(machine)
-    limit, at = vibration_limit(top), machine.vibration_at_maximum()
+    at = machine.vibration_at_maximum()
     if not at:
-        words = f"a record at the maximum speed, {top * _RPM:.5g} 1/min, or a run-up to it would"
-        yield Item(part=part, what="vibration at the maximum speed", outcome="missing", words=words)
+        record = f"a record at the maximum speed, {top * _RPM:.5g} 1/min, or a run-up to it,"
+        yield _missing("unbalance", "vibration at the maximum speed", record)
     for role, (value, sd, name) in at.items():
-        spread = math.hypot(sd, machine.gain_sd(role) * value)
-        yield Item(
-            part=part, what=f"synchronous vibration, {role.replace('_', ' ')}", value=value, sd=spread, unit="m",
-            limit=limit, limits="vibration", outcome=outcome_of(value, spread, limit), words=f"peak to peak, {name}",
+        spread, limit = math.hypot(sd, machine.gain_sd(role) * value), vibration_limit(top)
+        yield _item(
+            "unbalance", f"synchronous vibration, {role.replace('_', ' ')}", value, spread, "m",
+            f"peak to peak, {name}", outcome=outcome_of(value, spread, limit), limit=limit, limits="vibration",
         )  # fmt: skip
 
 
 def _scaled(machine: Machine) -> Iterator[Item]:
     """Compare the response of a run-up, scaled to the limit of vibration, with the clearance."""
-    part: Part = "unbalance"
-    clearance = machine.clearance()
-    if machine.passages and clearance is not None:
-        limit, room = 0.5 * vibration_limit(machine.speeds[1]), CLEARANCE_SHARE * clearance
-        for name, p in machine.passages.items():
-            for plane, _, _ in p.planes:
-                try:
-                    x = scaled_to_limit(p.speed, p.whirl(plane).major, machine.speeds, limit, room)
-                except EstimationError:
-                    continue
-                yield Item(
-                    part=part, what=f"response scaled to the limit, bearing {plane}, {name}", value=2.0 * x.largest,
-                    unit="m", limit=2.0 * room, limits="scaled", outcome="passed" if x.passed else "failed",
-                    words=f"peak to peak at {x.largest_at * _RPM:.5g} 1/min, {x.factor:.3g} times as measured",
-                )  # fmt: skip
-    else:
-        words = "a run-up to the maximum speed, with operation.touch_down in the rig, would"
-        yield Item(part=part, what="response scaled to the limit", outcome="missing", words=words)
-
-
-def _load(machine: Machine, plane: str) -> float | None:
-    """Return the mass that the bearing in a plane carries, kg; None: it is no bearing's plane, or not one of two."""
-    e = machine.estimate
-    radial = [b for b in e.plant.bearings if not b.axial]
-    if len(radial) != 2 or plane not in {f"{b.name}.z" for b in radial}:
-        return None
-    other = next(f"{b.name}.z" for b in radial if f"{b.name}.z" != plane)
-    z, far = e.numbers[plane], e.numbers[other]
-    return abs(e.numbers["m"] * (e.numbers["z_cg"] - far) / (z - far))
+    clearance, (low, top) = machine.clearance(), machine.speeds
+    low = min(low, (1.0 - _NEAR) * top)
+    runs = {name: p for name, p in machine.passages.items() if ((p.speed >= low) & (p.speed <= top)).any()}
+    if not runs or clearance is None:
+        record = "a run-up to the maximum speed, with operation.touch_down in the rig,"
+        yield _missing("unbalance", "response scaled to the limit", record)
+        return
+    limit, room = 0.5 * vibration_limit(top), CLEARANCE_SHARE * clearance
+    for name, p in runs.items():
+        for plane, _, _ in p.planes:
+            x = scaled_to_limit(p.speed, p.whirl(plane).major, (low, top), limit, room)
+            yield _item(
+                "unbalance", f"response scaled to the limit, bearing {plane}, {name}", 2.0 * x.largest, 0.0, "m",
+                f"peak to peak at {x.largest_at * _RPM:.5g} 1/min, {x.factor:.3g} times as measured",
+                outcome="passed" if x.passed else "failed", limit=2.0 * room, limits="scaled",
+            )  # fmt: skip
 
 
 def _collocation(machine: Machine) -> Iterator[Item]:
     """Say, mode by mode, whether magnet and sensor of a bearing move alike."""
-    part: Part = "collocation"
     e = machine.estimate
-    for r in range(1, len(e.modes) + 1):
-        for b in (b for b in e.plant.bearings if not b.axial):
-            for k in range(len(b.z_sensors)):
-                names = (f"mode{r}.{b.name}.z", f"mode{r}.{b.sensor_parameter(k)}")
-                magnet, sensor = (e.numbers[n] for n in names)
-                C = e.covariance_of(names)
-                ratio = sensor / magnet
-                g = np.array([-ratio, 1.0]) / magnet
-                sd = math.sqrt(max(float(g @ C @ g), 0.0))
-                side = "in phase" if ratio > 2.0 * sd else "opposed: a node lies between" if ratio < -2.0 * sd else None
-                yield Item(
-                    part=part, what=f"mode {r} ({e.modes[r - 1].frequency_hz.value:.4g} Hz), bearing {b.name}",
-                    value=ratio, sd=sd, unit="1", outcome="reported",
-                    words=f"motion at the sensor over that at the magnet, {side or 'its sign is not known'}",
-                )  # fmt: skip
-    if not e.modes:
-        yield Item(
-            part=part, what="bending modes", outcome="missing",
-            words="none lies in the excited band; a record excited up to the first one would",
-        )  # fmt: skip
+    if not e.modes and machine.rig.modes.count == 0:
+        yield _item("collocation", "bending modes", 0.0, 0.0, "1", "modes.count of the rig")
+    elif not e.modes:
+        record = "none lies in the excited band; a record excited up to the first one"
+        yield _missing("collocation", "bending modes", record)
+    radial = [(b, k) for b in e.plant.bearings if not b.axial for k in range(len(b.z_sensors))]
+    for r, mode in enumerate(e.modes, 1):
+        for b, k in radial:
+            names = (f"mode{r}.{b.name}.z", f"mode{r}.{b.sensor_parameter(k)}")
+            magnet, sensor = (e.numbers[n] for n in names)
+            ratio = sensor / magnet
+            sd = _spread(e.covariance_of(names), np.array([-ratio, 1.0]) / magnet)
+            side = "in phase" if ratio > 2.0 * sd else "opposed: a node lies between" if ratio < -2.0 * sd else "unsure"
+            what = f"mode {r} ({mode.frequency_hz.value:.4g} Hz), bearing {b.name}{f', sensor {k + 1}' if k else ''}"
+            yield _item("collocation", what, ratio, sd, "1", f"motion at the sensor over that at the magnet, {side}")
+
+
+def _spread(covariance: Array, slope: Array) -> float:
+    return math.sqrt(max(float(slope @ covariance @ slope), 0.0))
 
 
 def _capacity(machine: Machine) -> Iterator[Item]:
     """Say how much of its force each magnet needs for what it carries, by its current and position in the mean."""
-    part: Part = "capacity"
     e, limits = machine.estimate, machine.rig.limits
-    high = UNLIMITED if limits is None else limits.current
-    most = min(abs(high[0]), abs(high[1]))
+    most = min(abs(x) for x in (UNLIMITED if limits is None else limits.current))
     for axis in e.plant.axes:
-        role = f"{axis}_current"
-        seen = [b for b in machine.steady if role in b.record]
-        if not math.isfinite(most) or not seen:
-            what = "a rig with loop.limits.current" if seen else f"a record with the current of axis {axis}"
-            yield Item(part=part, what=f"axis {axis}", outcome="missing", words=f"{what} would")
-            continue
-        k_i, k_x = e.numbers[f"{axis}.k_i"], e.numbers[f"{axis}.k_x"]
-        C = e.covariance_of((f"{axis}.k_i", f"{axis}.k_x"))
-        loads = list[tuple[float, float]]()
-        for b in seen:
-            i, x = (float(np.mean(b.record[f"{axis}_{q}"].values)) for q in ("current", "position"))
-            g = np.array([i, -x])
-            spread = math.hypot(math.sqrt(max(float(g @ C @ g), 0.0)), machine.gain_sd(role) * k_i * i)
+        role, loads = f"{axis}_current", list[tuple[float, float]]()
+        names = (f"{axis}.k_i", f"{axis}.k_x")
+        k_i, k_x = (e.numbers[n] for n in names)
+        for b in (b for b in machine.steady if role in b.record):
+            i, x = (float(b.record[f"{axis}_{q}"].values.mean()) for q in ("current", "position"))
+            spread = math.hypot(_spread(e.covariance_of(names), np.array([i, -x])), machine.gain_sd(role) * k_i * i)
             loads.append((abs(k_i * i - k_x * x), spread))
-        load, sd = max(loads)
-        yield Item(
-            part=part, what=f"axis {axis}", value=load, sd=sd, unit="N", limit=abs(k_i) * most,
-            outcome=outcome_of(load, sd, abs(k_i) * most),
-            words=f"static load beside k_i times the largest current, {100.0 * load / (abs(k_i) * most):.2g} % of it",
-        )  # fmt: skip
+        if not math.isfinite(most) or not loads:
+            what = "a rig with loop.limits.current" if loads else f"a record with the current of axis {axis}"
+            yield _missing("capacity", f"axis {axis}", what)
+            continue
+        (load, sd), capacity = max(loads), abs(k_i) * most
+        words = f"static load beside k_i times the largest current, {100.0 * load / capacity:.2g} % of it"
+        yield _item(
+            "capacity", f"axis {axis}", load, sd, "N", words, outcome=outcome_of(load, sd, capacity), limit=capacity
+        )
 
 
 def _touch_down(machine: Machine) -> Iterator[Item]:
-    """Compare the largest displacement of any record with the clearance, which these records do not measure."""
-    part: Part = "touch_down"
+    """Compare the largest displacement of any record with the clearance, and that with what the stops show."""
+    stops = [b for b in machine.benches if b.kind == "stops"]
     for bearing in machine.estimate.plant.bearings:
         clearance = machine.clearance(axial=bearing.axial)
         if clearance is not None:
-            tops = [_largest(b.record, bearing.axes) for b in machine.benches]
-            yield Item(
-                part=part, what=f"largest displacement, bearing {bearing.name}", value=max(tops), unit="m",
-                limit=clearance, outcome="passed" if max(tops) < clearance else "failed",
-                words=f"{100.0 * max(tops) / clearance:.3g} % of the clearance, with the excitation",
+            top = max((machine.largest(b, bearing) for b in machine.benches if b not in stops), default=0.0)
+            yield _item(
+                "touch_down", f"largest displacement, bearing {bearing.name}", top, 0.0, "m",
+                f"{100.0 * top / clearance:.3g} % of the clearance, with the excitation",
+                outcome="passed" if top < clearance else "failed", limit=clearance,
             )  # fmt: skip
-    yield Item(
-        part=part, what="the clearance itself", outcome="missing",
-        words="a record of the rotor set down and moved along its stops in every direction would",
-    )  # fmt: skip
-
-
-def _largest(record: Record, axes: Sequence[str]) -> float:
-    samples: Array = np.column_stack([record[f"{axis}_position"].values for axis in axes])
-    return float(np.max(np.linalg.norm(samples, axis=1)))
+        for b in stops:
+            reach = _reach(b.record, bearing.axes)
+            sd = machine.gain_sd(f"{bearing.axes[0]}_position") * reach
+            words = f"least way to the stops, {b.name}"
+            if clearance is not None:
+                words += f"; {clearance * 1e6:.4g} um in the rig"
+            yield _item("touch_down", f"clearance, bearing {bearing.name}", reach, sd, "m", words)
+    if not stops:
+        record = "a record of the rotor set down and moved along its stops in every direction"
+        yield _missing("touch_down", "the clearance itself", record)

@@ -42,7 +42,7 @@ _OF_PART: dict[Part, tuple[str, ...]] = {
     "sensitivity": ("sensitivity", "sensitivity C"), "vibration": ("displacement",),
     "critical": ("amplification", "separation"), "unbalance": ("unbalance", "vibration", "scaled"),
 }  # fmt: skip
-_KINDS = {"rest": "at rest", "speed": "at speed", "run-up": "run-up or coast-down"}
+_KINDS = {"rest": "at rest", "speed": "at speed", "run-up": "run-up or coast-down", "stops": "along the stops"}
 _OWN = {"kg m": (1e6, "g mm"), "rad/s": (_RPM, "1/min")}  # units that people read
 _NONE = "–"
 

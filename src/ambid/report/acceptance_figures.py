@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ambid.arrays import Complex
 from ambid.control.acceptance import Acceptance, Part, Run
 from ambid.report.drawing import BOUND, GREEN, MEASURED, ORANGE, PREDICTED, Block, head, log_axis, panel
 from ambid.report.margins import sensitivity_panel
@@ -37,8 +38,8 @@ _ORBITS = "Above what turns with the rotor, below the rest, the excitation among
 _BODE_SAYS = "What turns with the rotor, from blocks of whole turns, runout of the sensors included."
 _FALLS = "Amplitude spectra over the speed; each line stands at the height of its speed."
 _WHIRL = (
-    "Where the loop of plant and controller as identified resonates at each speed, and the critical speeds that the "
-    "run-ups show."
+    "Where the loop of plant and controller as identified resonates at each speed; beside it the critical speeds that "
+    "run-ups show, and modes that noise shows in records at one speed."
 )
 
 
@@ -187,7 +188,7 @@ def _polar(axes: Axes, run: Run, roles: Sequence[str], name: str) -> None:
         steps = np.linspace(0, z.size - 1, _MARKS).round().astype(int)
         axes.plot(z[steps].real, z[steps].imag, "o", color=MEASURED, markersize=3, linestyle="none")
         if role == roles[0]:
-            for k in steps:
+            for k in _apart(z, steps):
                 axes.annotate(
                     f"{run.speed[k] * _RPM:.0f}", (z[k].real, z[k].imag), xytext=(4, 3), textcoords="offset points",
                     fontsize=7,
@@ -198,6 +199,15 @@ def _polar(axes: Axes, run: Run, roles: Sequence[str], name: str) -> None:
     axes.set_xlabel(f"in phase with the mark [{unit}]")
     axes.set_ylabel(f"90° ahead [{unit}]")
     head(axes, f"bearing {name}; speeds in 1/min")
+
+
+def _apart(z: Complex, steps: Any) -> list[int]:
+    """Return those of some places whose names do not lie on each other."""
+    named = list[int]()
+    for k in (int(step) for step in steps):
+        if all(abs(z[k] - z[m]) > 0.12 * np.abs(z).max() for m in named):
+            named.append(k)
+    return named
 
 
 def _waterfall(axes: Axes, fall: Waterfall, k: int, role: str) -> None:
@@ -240,7 +250,12 @@ def _whirl(axes: Axes, a: Acceptance) -> None:
         axes.plot(
             w * _RPM, w / (2.0 * np.pi), "o", color=BOUND, markersize=6, linestyle="none", label="measured in run-ups"
         )  # fmt: skip
-    axes.set_xlim(0.0, float(speed[-1]))
+    if a.points:
+        x, y = (np.array(v) for v in zip(*((abs(p.speed), p.frequency.value) for p in a.points), strict=True))
+        axes.plot(
+            x * _RPM, y / (2.0 * np.pi), "s", color=GREEN, markersize=4, linestyle="none", label="shown by noise"
+        )  # fmt: skip
+    axes.set_xlim(-0.01 * float(speed[-1]), float(speed[-1]))
     axes.set_ylim(0.0, float(speed[-1]) / 60.0 * 1.1)
     axes.set_xlabel("speed [1/min]")
     axes.set_ylabel("frequency [Hz]")
