@@ -107,7 +107,7 @@ _EDGE = (_LEAF[0] - WIDE) / 2
 
 _HEAD, _FOOT = 1.0, 0.35  # inches above and below a figure
 
-_LETTERS = 160  # of a line
+_LETTERS, _HEADLINE = 160, 85  # of a line
 
 _PLAIN: dict[str, Any] = {"size": 8, "family": "monospace"}
 
@@ -122,7 +122,9 @@ def page_pdf(document: Document, verdict: Verdict, *, made: str = "") -> bytes:
 
     words, style = WORDS[verdict.word]
     title = document.headline or document.title
-    lines: list[Said] = [(title, {"size": 15, "weight": "bold"}), *_wrapped(document.subtitle, _DIM)]
+    headline: dict[str, Any] = {"size": 15, "weight": "bold"}
+    lines: list[Said] = [(line, headline) for line in textwrap.wrap(title, _HEADLINE)]
+    lines += _wrapped(document.subtitle, _DIM)
     lines += [(f"verdict: {words}", {"size": 12, "weight": "bold", "color": STYLES[style]}), (f"{SPREAD}.", _DIM)]
     for reason in verdict.reasons:
         lines += _wrapped(f"{reason.check}: {reason.text}", {"size": 9})
