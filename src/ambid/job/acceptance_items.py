@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.control.acceptance import (
     Item,
     Outcome,
@@ -24,12 +24,14 @@ from ambid.control.limits import AMPLIFICATION, CLEARANCE_SHARE, residual_unbala
 from ambid.control.margins import Margins
 from ambid.control.zones import DISPLACEMENT, ZONES, Grade
 from ambid.estimation.result import NORMAL_95
+from ambid.job.closed_loop import spectra_of
 from ambid.job.rotor import RotorRecord
 from ambid.physics.loop import UNLIMITED
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rig.rotor import Operation
+from ambid.rotor.balance import Turned
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of
 from ambid.rotor.resonance import Resonances, resonances, scaled_to_limit, separations
@@ -90,6 +92,16 @@ def _reach(record: Record, axes: Sequence[str]) -> float:
     return float(min(tops)) if min(tops) > _ROUND * max(tops) and np.mean(size > 0.8 * min(tops)) > _STAYS else 0.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Turn:
+    """What turns with the rotor in a record at one speed."""
+
+    orders: tuple[int, ...]
+    amplitude: Mapping[str, Complex]  # by role, of each order
+    sd: Mapping[str, float]  # of the first
+    apart: bool  # whether the response to an excitation is taken out of it
+
+
 @dataclass(frozen=True, eq=False)
 class Machine:
     """What all items are made from."""
@@ -108,6 +120,24 @@ class Machine:
         """What turns with the rotor in each run-up, by its record."""
         runs = [b for b in self.benches if b.kind == "run-up"]
         return {b.name: track_passage(b.record, self.estimate.plant) for b in runs}
+
+    @cached_property
+    def turning(self) -> dict[str, Turn]:
+        """What turns with the rotor in each record at one speed, by its record."""
+        return {b.name: self._turn(b) for b in self.steady if b.apart is not None and b.apart.response is not None}
+
+    def _turn(self, b: Bench) -> Turn:
+        """Take the response to the excitation out where it falls on the speed or its harmonics."""
+        assert b.apart is not None
+        r, plant = b.apart.response, self.estimate.plant.at_speed(b.speed)
+        assert r is not None
+        spectra = spectra_of(b.apart.record, plant, b.speed) if any(r.together) else None
+        parts = [Turned(record=0, response=r, spectra=spectra).own(order) for order in r.orders]
+        at = {role: k for k, role in enumerate(r.roles[: parts[0][0].size])}
+        return Turn(
+            orders=r.orders, amplitude={x: np.array([a[k] for a, _, _ in parts]) for x, k in at.items()},
+            sd={x: float(parts[0][1][k]) for x, k in at.items()}, apart=all(apart for *_, apart in parts),
+        )  # fmt: skip
 
     @cached_property
     def resonances(self) -> Resonances | None:
@@ -159,11 +189,11 @@ class Machine:
         """
         top, plant = self.speeds[1], self.estimate.plant
         radial = [r for r in plant.outputs if "_position" in r and not _axial(plant, r)]
-        near = [b for b in self.steady if top and abs(abs(b.speed) / top - 1.0) < _NEAR and b.apart is not None]
-        for b in sorted(near, key=lambda b: abs(abs(b.speed) - top)):
-            r = None if b.apart is None else b.apart.response
-            if r is not None:
-                return {x: (2.0 * abs(r.of(x)), 2.0 * float(r.sd()[r.roles.index(x)]), b.name) for x in radial}
+        near = [b for b in self.steady if b.name in self.turning and abs(abs(b.speed) - top) < _NEAR * top]
+        if near:
+            name = min(near, key=lambda b: abs(abs(b.speed) - top)).name
+            of, said = self.turning[name], "" if self.turning[name].apart else ", with the excitation"
+            return {x: (2.0 * abs(of.amplitude[x][0]), 2.0 * of.sd[x], f"{name}{said}") for x in radial}
         for name, p in self.passages.items():
             k = int(np.argmin(np.abs(p.speed - top)))
             if abs(p.speed[k] / top - 1.0) < _NEAR:
@@ -244,14 +274,15 @@ def _displacement(machine: Machine, b: Bench, bearing: Bearing) -> tuple[float, 
     """
     roles = [f"{axis}_position" for axis in bearing.axes]
     gain = max(machine.gain_sd(role) for role in roles)
-    if b.apart is None or b.apart.excitation is None or b.apart.response is None:
+    of = machine.turning.get(b.name)
+    if of is None or not of.apart or b.apart is None or b.apart.excitation is None:
         top = machine.largest(b, bearing)
         return top, gain * top, "largest sample"
-    r = b.apart.response
-    at, mean = [r.roles.index(role) for role in roles], [float(b.record[role].values.mean()) for role in roles]
-    turn = np.exp(1j * np.outer(np.linspace(0.0, 2.0 * np.pi, 720), r.orders))
-    top = float(np.max(np.linalg.norm(mean + (turn @ r.amplitude[:, at]).real, axis=1)))
-    return top, math.hypot(float(np.linalg.norm(r.sd()[at])), gain * top), "mean and synchronous part"
+    mean = [float(b.record[role].values.mean()) for role in roles]
+    turn = np.exp(1j * np.outer(np.linspace(0.0, 2.0 * np.pi, 720), of.orders))
+    waves = np.column_stack([(turn @ of.amplitude[role]).real for role in roles])
+    top = float(np.max(np.linalg.norm(mean + waves, axis=1)))
+    return top, math.hypot(*(of.sd[role] for role in roles), gain * top), "mean and synchronous part"
 
 
 def _bearings(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
@@ -262,10 +293,10 @@ def _bearings(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
     axes, top, G = loop.plant.axes, machine.speeds[1], np.abs(loop.compliance)
     if top:
         at = loop.at(np.array([top / (2.0 * np.pi)]))
-        values, sd, where = dynamic_stiffness(at)[0], stiffness_sd(at)[0], f"at {top * _RPM:.5g} 1/min"
+        values, sd, where = dynamic_stiffness(at)[0], stiffness_sd(at)[0], f"at {top * _RPM:.5g} 1/min, axis"
         for axis, x, s in zip(axes, values, sd, strict=True):
-            yield _item("bearings", f"stiffness, axis {axis}", x.real, s.real, "N/m", where)
-            yield _item("bearings", f"damping, axis {axis}", x.imag / top, s.imag / top, "N s/m", where)
+            yield _item("bearings", f"stiffness {where} {axis}", x.real, s.real, "N/m")
+            yield _item("bearings", f"damping {where} {axis}", x.imag / top, s.imag / top, "N s/m")
     for j, axis in enumerate(axes):
         k = int(np.argmax(G[:, j]))
         words = f"of the rotor in the closed loop, at {loop.frequency_hz[k]:.4g} Hz"
