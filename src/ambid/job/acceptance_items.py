@@ -21,25 +21,27 @@ from ambid.control.acceptance import (
 )
 from ambid.control.closed import ClosedLoop
 from ambid.control.limits import AMPLIFICATION, CLEARANCE_SHARE, residual_unbalance, vibration_limit
-from ambid.control.margins import Margins
+from ambid.control.margins import Margins, synchronous
 from ambid.control.zones import DISPLACEMENT, ZONES, Grade
 from ambid.estimation.result import NORMAL_95
 from ambid.job.closed_loop import spectra_of
-from ambid.job.rotor import RotorRecord
+from ambid.job.rotor import RotorRecord, balance_planes
 from ambid.physics.loop import UNLIMITED
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rig.rotor import Operation
+from ambid.rotor.balance import Machine as Rotor
 from ambid.rotor.balance import Turned
 from ambid.rotor.estimate import RotorEstimate
-from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of
-from ambid.rotor.resonance import Resonances, resonances, scaled_to_limit, separations
+from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of, whirl_of
+from ambid.rotor.resonance import Peak, Resonances, peaks, resonances, scaled_to_limit, separations
 from ambid.rotor.synchronous import Separated, separate
 
 _RPM = 30.0 / math.pi
 _SECTORS, _ROUND = 8, 0.5  # directions; the least reach over the largest, of a rotor that is moved along its stops
 _STOP, _STAYS = 0.95, 0.3  # quantile of a direction that is its stop; share of the samples near the stops
+_STEPS, _LIKE = 400, 0.05  # speeds of a response; relative difference of critical speeds that are one
 _NEAR = 0.03  # of the maximum speed, within which a record is one at it
 
 
@@ -209,7 +211,7 @@ def _axial(plant: RotorModel, role: str) -> bool:
 def items_of(machine: Machine, margins: Mapping[str, Margins], loop: ClosedLoop | None) -> list[Item]:
     """Return all items; `margins`: of the loop of each steady record, `loop`: that of the fastest."""
     return [
-        *_sensitivity(margins), *_vibration(machine), *_bearings(machine, loop), *_critical(machine),
+        *_sensitivity(margins), *_vibration(machine), *_bearings(machine, loop), *_critical(machine, loop),
         *_unbalance(machine), *_collocation(machine), *_capacity(machine), *_touch_down(machine),
     ]  # fmt: skip
 
@@ -303,20 +305,27 @@ def _bearings(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
         yield _item("bearings", f"least dynamic stiffness, axis {axis}", 1.0 / G[k, j], 0.0, "N/m", words)
 
 
-def _critical(machine: Machine) -> Iterator[Item]:
+def _critical(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
     """Judge the separation of each critical speed from the range of operation, by its amplification factor."""
     if machine.resonances is None:
         record = "a record of a run-up or coast-down with a channel of angle, pulses or speed"
         yield _missing("critical", "critical speeds", record)
         return
-    top = machine.speeds[1]
+    top, alone = machine.speeds[1], _of_unbalance(machine, loop)
     for k, x in enumerate(separations(machine.resonances.resonances, machine.speeds), 1):
         r, factor = x.resonance, x.resonance.amplification
         way = "" if r.forward is None else f", {100.0 * r.forward:.0f} % of the motion forward"
         words = f"damping ratio {100.0 * r.damping.value:.3g} %, largest in bearing {r.plane}{way}"
+        near = min(alone, key=lambda p: abs(p.speed - r.speed.value), default=None)
+        if near is None or r.critically_damped or abs(near.speed / r.speed.value - 1.0) > _LIKE:
+            near = None
+        if near is not None:
+            words += f"; {near.speed * _RPM:.5g} 1/min by the machine as identified, without run-out"
         yield _item("critical", f"critical speed {k}", r.speed.value, r.speed.sd, "rad/s", words)
         how = "by half-power points" if r.half_power else "1/(2 damping ratio)"
         words = f"{how}: critically damped, no separation is needed" if r.critically_damped else how
+        if near is not None and near.amplification is not None:
+            words += f"; {near.amplification:.3g} by the machine as identified"
         yield _item(
             "critical", f"amplification factor {k}", factor.value, factor.sd, "1", words,
             limit=AMPLIFICATION, limits="amplification",
@@ -334,6 +343,21 @@ def _critical(machine: Machine) -> Iterator[Item]:
         yield _item("critical", "speed without a critical one", fastest, 0.0, "rad/s", "highest of the run-ups")
     if fastest < top:
         yield _missing("critical", "critical speeds up to the maximum", f"a run-up to {top * _RPM:.5g} 1/min")
+
+
+def _of_unbalance(machine: Machine, loop: ClosedLoop | None) -> list[Peak]:
+    """Return the peaks of what the identified unbalance alone does in the loop as identified, over the speed."""
+    e, planes = machine.estimate, machine.estimate.synchronous.get("unbalance", {}).get("planes", {})
+    if loop is None or not machine.passages or not planes or not all(p["identifiable"] for p in planes.values()):
+        return []
+    rotor = Rotor.of(e, balance_planes(e, machine.rig))
+    force = sum(p["value"] * np.exp(1j * p["phase"]) * rotor.shape(name) for name, p in planes.items())
+    speed = np.linspace(1.0 / _STEPS, 1.0, _STEPS) * machine.fastest
+    moved = synchronous(loop, rotor, speed / (2.0 * np.pi), np.asarray(force)[:, None], None)[:, :, 0]
+    passage, first = next(iter(machine.passages.values())), len(e.plant.inputs)
+    at = [first + e.plant.outputs.index(role) for role in passage.roles]
+    sizes = [whirl_of(moved[:, [at[x], at[y]]], np.zeros((_STEPS, 2))).major for _, x, y in passage.planes]
+    return [p for size in sizes for p in peaks(speed, size)]
 
 
 def _unbalance(machine: Machine) -> Iterator[Item]:

@@ -97,8 +97,8 @@ def _part(a: Acceptance, k: int, part: Part) -> Section:
     """One part: its items, then the limits with their sources."""
     items = a.of(part)
     columns = [
-        Column(cell=lambda x: x.what), Column(label="measured", cell=_measured, sparse=True),
-        Column(label="limit", cell=_limit, sparse=True), Column(label="outcome", cell=lambda x: _OUTCOMES[x.outcome]),
+        Column(cell=lambda x: x.what), Column(label="outcome", cell=lambda x: _OUTCOMES[x.outcome]),
+        Column(label="measured", cell=_measured, sparse=True), Column(label="limit", cell=_limit, sparse=True),
         Column(cell=lambda x: (x.words, ""), sparse=True),
     ]  # fmt: skip
     said = Lines(lines=[f"{x.what}: {x.words}" for x in items if x.words], indent=2)

@@ -35,7 +35,10 @@ _FORCE = (
 )
 _SHAPES = "Where a sensor and its magnet stand on different sides of a node, the loop moves that mode the other way."
 _ORBITS = "Above what turns with the rotor, below the rest, the excitation among it, beside the clearance."
-_BODE_SAYS = "What turns with the rotor, from blocks of whole turns, runout of the sensors included."
+_BODE_SAYS = (
+    "What turns with the rotor, from blocks of whole turns, run-out of the sensors included, which moves critical "
+    "speeds beyond their intervals: these hold noise alone."
+)
 _FALLS = "Amplitude spectra over the speed; each line stands at the height of its speed."
 _WHIRL = (
     "Where the loop of plant and controller as identified resonates at each speed; beside it the critical speeds that "
