@@ -10,9 +10,8 @@ import socket
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ambid.errors import AmbidError, counted, nearest
@@ -51,7 +50,7 @@ def rename(c: Connection, ledger: str, bearing: str, new: str, record: str | Non
     if name == bearing:
         raise AmbidError(f"{setting('rename', repr(new))}: the bearing has that name already. Give another")
     own = estimates_of(c, ledger, bearing, record)
-    there = {e.sha for e in stored(c, partial(_has_name, name))}
+    there = {e.sha for e in stored(c, name)}
     twice = {e.sha: e for e in own if e.sha in there}
     text = f"{bearing!r} became {name!r} ({_counted(own)})"
     if twice:
@@ -115,7 +114,7 @@ def _back(c: Connection, old: Mapping[str, Before | None], since: float) -> dict
             moves[e.key] = (REMOVED, e.taken_at) if before is None else _put_back(e, before)
             records.setdefault(e.bearing, {}).update({} if before is None else {e.sha: before})
     for name, of in records.items():
-        for e in stored(c, partial(_has_name, name)) if of else ():
+        for e in stored(c, name) if of else ():
             if e.sha in of and e.added_at > since and e.key not in old:
                 moves[e.key] = _put_back(e, of[e.sha])
     return moves
@@ -239,7 +238,7 @@ def _follow(c: Connection, source: tuple[int, str], target: tuple[int, str]) -> 
 def estimates_of(c: Connection, ledger: str, bearing: str, record: str | None) -> list[Stored]:
     """Return the estimates of a bearing, or of one record of it, by the name of its file or digits of its SHA-256."""
     bearing_of(c, bearing, ledger)
-    own = stored(c, partial(_has_name, bearing))
+    own = stored(c, bearing)
     if record is None:
         return own
     of = [
@@ -264,27 +263,20 @@ def estimates_of(c: Connection, ledger: str, bearing: str, record: str | None) -
     return of
 
 
-def stored(c: Connection, where: Callable[[Any, Any], Any]) -> list[Stored]:
-    """Return estimates in order of time; `where`: condition on the columns of bearings and estimates."""
+def stored(c: Connection, bearing: str = "", *, keys: Sequence[str] | None = None) -> list[Stored]:
+    """Return the estimates of a bearing, or those of some keys, in order of time."""
     from sqlalchemy import select
 
     t = tables().tables
     b, e = t["bearing"].c, t["estimate"].c
     query = select(e.key, e.id, e.sha, e.record, b.name, e.taken_at, e.added_at).join_from(t["estimate"], t["bearing"])
-    return [Stored(*row) for row in c.execute(query.where(where(b, e)).order_by(e.taken_at, e.id))]
+    where = b.name == bearing if keys is None else e.key.in_(keys)
+    return [Stored(*row) for row in c.execute(query.where(where).order_by(e.taken_at, e.id))]
 
 
 def stored_by_key(c: Connection, keys: Iterable[str]) -> list[Stored]:
     """Return estimates by their keys; those that are not there are passed over."""
-    return [e for some in chunks(list(keys)) for e in stored(c, partial(_has_key, some))]
-
-
-def _has_name(name: str, bearing: Any, _: Any) -> Any:
-    return bearing.name == name
-
-
-def _has_key(keys: Sequence[str], _: Any, estimate: Any) -> Any:
-    return estimate.key.in_(keys)
+    return [e for some in chunks(list(keys)) for e in stored(c, keys=some)]
 
 
 def _some(names: Sequence[str]) -> str:
