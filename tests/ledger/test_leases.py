@@ -30,7 +30,7 @@ def test_a_record_is_in_one_hand(two):
     assert (first.others, second.others) == (0, 1)
     first.release(["1", "3"])
     first.take({})
-    assert second.take(THREE) == {"1", "3"}
+    assert second.take({"1": "a.h5", "2": "b.h5"}) == {"1"}
     assert rows(second, "record") == ["a.h5", "b.h5", "c.h5"]
     first.close()
     assert rows(second) == ["1", "3"]

@@ -19,7 +19,7 @@ from ambid.settings.caller import Language, language, setting, speaking
 
 ALLOWED_FAILURES = 2  # workers that a task may have killed before it is held to be poison
 _AHEAD = 3  # batches on their way for each worker
-_BATCH_S, _BATCH = 0.25, 64  # a batch takes about so long, and has at most so many tasks
+_BATCH_S, _BATCH = 1.0, 64  # a batch takes about so long, and has at most so many tasks
 _END = object()
 _GONE_S = 30.0  # without a worker, after which a cluster on this machine gets new ones
 _LOOK_S = 0.2  # how often a wait looks whether it should end

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -39,13 +40,19 @@ class Pace:
         else:
             self._busy_s += seconds
 
+    @property
+    def mean_s(self) -> float:
+        """What a record takes; infinite as long as nothing is known."""
+        n, seconds = (self._sums if self._sums[0] else self._first)[0:4:3]
+        return seconds / n if n else math.inf
+
     def left_s(self, runs: int = 1) -> float | None:
         """Return how long the rest takes where so many runs share it; None as long as nothing is known."""
         sums = self._sums if self._sums[0] else self._first
         if not sums[0]:
             return None
         fixed, by_size = _line(*sums)
-        mean_s = max(sums[3] / sums[0], 1e-9)
+        mean_s = max(self.mean_s, 1e-9)
         passed = time.monotonic() - self._since
         at_once = (self._busy_s + self._workers * mean_s) / (passed + mean_s)  # at first as many as there are workers
         return (fixed * self._left + by_size * max(self._size_left, 0.0)) / (max(at_once, 1e-9) * runs)

@@ -38,7 +38,7 @@ JOBS = ("identify", "identify_nonlinear", "fit", "frf", "info", "margins", "vali
 
 _OWN = ("record", "records", "rig", "tick", "units")  # arguments that are no settings
 _ASKED, _ASKED_S = 200, 0.25  # keys that a ledger is asked for at once, and for how long they are looked up
-_PORTION_S = 1.0  # work that is taken in hand together, where several runs share a list
+_PORTION_S = 2.0  # work that is taken in hand together, where several runs share a list
 _PROBED = 10  # rigs with which it is asked what a job says to its settings
 _LOOK_S = 0.5  # how often it is looked what other runs have done
 _STORE_S = 0.25  # results of so long are stored together
@@ -242,9 +242,9 @@ class _Run:
             yield from self._taken([*self._elsewhere.values()])
 
     def _portion(self) -> int:
-        """Return how many records are taken in hand together: about a second's work, fewer towards the end."""
-        rate = self.counts["done"] / (time.monotonic() - self._begin)
-        return max(self.workers, min(int(rate * _PORTION_S), (len(self.fleet) - self._reached) // 8, _ASKED))
+        """Return how many records are taken in hand together: about two seconds' work, fewer towards the end."""
+        wanted = self.workers * int(_PORTION_S / max(self.pace.mean_s, 1e-3))
+        return max(self.workers, min(wanted, (len(self.fleet) - self._reached) // 8, _ASKED))
 
     def _unknown(self, ledger: Ledger) -> Iterator[_Task]:
         """Yield the records of which the ledger knows nothing, the first of each contents."""

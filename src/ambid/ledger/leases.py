@@ -7,7 +7,7 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from uuid import uuid4
 
 from ambid.ledger import entry
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 HEARTBEAT_S = 5.0
 LIMIT_S = 60.0
-"""A lease whose heartbeat is older may be taken over."""
+"""A lease whose heartbeat is older may be taken over, as that of a clock which was set back since."""
 _FORGOTTEN_S = 86_400.0  # what nobody came back for is swept
 _LOCK = 7281002  # one at a time on PostgreSQL: rows of two statements are locked in no certain order
 
@@ -34,31 +34,28 @@ class Leases:
         self._held, self._over = set[str](), set[str]()  # what is over is given back on the way
         self._beat_at = time.monotonic()
 
-    def take(self, records: dict[str, str]) -> frozenset[str]:
+    def take(self, records: dict[str, str]) -> set[str]:
         """Take those that nobody has in hand, or whose owner is gone, and return their keys; `records`: names by the
         key of the estimate to come.
         """
-        from sqlalchemy import insert, or_, select, update
+        from sqlalchemy import insert, select, update
 
         t = entry.tables().tables["claim"]
-        held = t.c
         with self._ledger._writing_alone(_LOCK) as (c, now):
             self._give_back(c)
-            there = {row.key: row.owner for row in c.execute(select(held.key, held.owner).where(held.key.in_(records)))}
-            owners = c.execute(select(held.owner).where(_fresh(held, now)).distinct()).scalars().all()
-            gone = [x for x in owners if _is_gone(x)]
-            self.others = len(set(owners) - {self.owner, *gone})
-            free = or_(held.owner.in_(gone), ~_fresh(held, now))
+            held = {row.key: row for row in c.execute(select(t.c.key, t.c.owner, t.c.heartbeat_at))}
+            fresh = {key: row.owner for key, row in held.items() if abs(now - row.heartbeat_at) <= LIMIT_S}
+            alive = {owner for owner in {*fresh.values()} if not _is_gone(owner)}
+            self.others = len(alive - {self.owner})
+            left = [key for key in records if key in held and fresh.get(key) not in alive]
             mine = {"owner": self.owner, "begun_at": now, "heartbeat_at": now}
-            if there:
-                c.execute(update(t).where(held.key.in_(there), free).values(**mine, tries=held.tries + 1))
-            rows = [{"key": k, "record": name, "tries": 1, **mine} for k, name in records.items() if k not in there]
-            if rows:
-                c.execute(insert(t), rows)
-            query = select(held.key).where(held.owner == self.owner, held.key.in_(records))
-            taken = frozenset(c.execute(query).scalars())
-        self._held |= taken
-        return taken
+            if left:
+                c.execute(update(t).where(t.c.key.in_(left)).values(**mine, tries=t.c.tries + 1))
+            new = [key for key in records if key not in held]
+            if new:
+                c.execute(insert(t), [{"key": key, "record": records[key], "tries": 1, **mine} for key in new])
+        self._held |= {*left, *new}
+        return {*left, *new}
 
     def release(self, keys: Iterable[str]) -> None:
         """Give some back, with whatever is written next: that of which the ledger has a result is in nobody's way."""
@@ -91,11 +88,6 @@ class Leases:
         t = entry.tables().tables["claim"]
         with self._ledger._writing_alone(_LOCK) as (c, now):
             c.execute(delete(t).where(or_(t.c.owner == self.owner, t.c.heartbeat_at < now - _FORGOTTEN_S)))
-
-
-def _fresh(held: Any, now: float) -> Any:
-    """Whether a heartbeat is young; one far in the future is of a clock that was set back."""
-    return held.heartbeat_at.between(now - LIMIT_S, now + LIMIT_S)
 
 
 def _process_of(pid: int) -> str:
