@@ -14,12 +14,12 @@ from ambid.signals import excitation
 from ambid.simulation import Simulation, simulate_preset
 
 SEED = 3
-DURATION_S = 0.4
+DURATION_S = 0.2
 AMPLITUDE_V = 20.0
 BAND_HZ = (5.0, 2000.0)
 
 # As a data logger would: header, factor from SI, digits after the point.
-_COLUMNS = (("voltage", "V", 1.0, 3), ("current", "mA", 1e3, 2), ("position", "um", 1e6, 3))
+_COLUMNS = (("voltage", "V", 1.0, 2), ("current", "mA", 1e3, 1), ("position", "um", 1e6, 2))
 
 
 def demo_simulation() -> Simulation:
@@ -36,7 +36,7 @@ def demo_simulation() -> Simulation:
 def demo_csv(simulation: Simulation) -> str:
     """Write the record of the demo with the few digits that a logger keeps.
 
-    `simulation`: as `demo_simulation` gives it. Returns CSV: voltage to 1 mV, current to 10 uA, position to 1 nm.
+    `simulation`: as `demo_simulation` gives it. Returns CSV: voltage to 10 mV, current to 0.1 mA, position to 10 nm.
     """
     record = simulation.record
     lines = [

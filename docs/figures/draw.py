@@ -274,7 +274,7 @@ def demo() -> Figure:
     free = [p for p in estimate.parameters if p.role == "free"]
     figure = plt.figure(figsize=(9.0, 3.0), layout="constrained")
     left, right = figure.subfigures(1, 2)
-    left.suptitle("in: 0.4 s of a levitated rotor", fontsize=10)
+    left.suptitle("in: 0.2 s of a levitated rotor", fontsize=10)
     channels = zip(
         left.subplots(3, 1, sharex=True),
         (("voltage", 1.0, "V"), ("current", 1e3, "mA"), ("position", 1e6, "µm")),
@@ -284,6 +284,7 @@ def demo() -> Figure:
         ax.plot(record.time_s, scale * record.channel(name).values, color=SOFT, lw=0.6)
         ax.set_ylabel(f"{name}\n[{unit}]")
     ax.set_xlabel("time [s]")
+    ax.locator_params(axis="x", nbins=5)
     right.suptitle("out: five parameters, error and 95 % interval in %", fontsize=10)
     ax = right.subplots()
     off = [100.0 * (p.value / truth[p.name] - 1.0) for p in free]

@@ -20,13 +20,13 @@ def test_the_embedded_record_is_what_its_recipe_gives():
     stored, made = gzip.decompress(content).decode(), demo_csv(demo_simulation())
     assert stored.splitlines()[:2] == made.splitlines()[:2]
     # one unit of the last printed digit: another processor may round a halfway case the other way
-    assert np.all(np.abs(numbers(stored) - numbers(made)) <= [1e-9, 1.001e-3, 1.001e-2, 1.001e-3])
+    assert np.all(np.abs(numbers(stored) - numbers(made)) <= [1e-9, 1.001e-2, 1.001e-1, 1.001e-2])
 
 
 def test_the_embedded_record_is_sound():
     assert demo_simulation().warnings == ()
     with gzip.open(str(demo_file("demo.csv.gz")), "rt") as file:
-        assert len(file.readlines()) == 8002
+        assert len(file.readlines()) == 4002
 
 
 def test_the_rig_of_the_demo_knows_nothing(tmp_path):
