@@ -40,7 +40,7 @@ def test_a_record_is_in_one_hand(two):
 def test_a_lease_without_a_heartbeat_is_taken_over(two, age_s):
     first, second = two
     first.take(THREE)
-    with first._ledger._writing_alone(1) as (c, now):
+    with first._ledger._leasing() as (c, now):
         c.execute(text(f"UPDATE claim SET heartbeat_at = {now - age_s} WHERE key = '2'"))
     assert second.take(THREE) == {"2"}
     assert rows(second, "tries") == [1, 2, 1]
@@ -51,7 +51,7 @@ def test_a_lease_without_a_heartbeat_is_taken_over(two, age_s):
 def test_a_heartbeat_keeps_it(two, monkeypatch):
     first, second = two
     first.take(THREE)
-    with first._ledger._writing_alone(1) as (c, now):
+    with first._ledger._leasing() as (c, now):
         c.execute(text(f"UPDATE claim SET heartbeat_at = {now - leases.LIMIT_S - 1}"))
     monkeypatch.setattr(leases, "HEARTBEAT_S", 0.0)
     first.beat()

@@ -20,7 +20,6 @@ HEARTBEAT_S = 5.0
 LIMIT_S = 60.0
 """A lease whose heartbeat is older may be taken over, as that of a clock which was set back since."""
 _FORGOTTEN_S = 86_400.0  # what nobody came back for is swept
-_LOCK = 7281002  # one at a time on PostgreSQL: rows of two statements are locked in no certain order
 
 
 class Leases:
@@ -41,7 +40,7 @@ class Leases:
         from sqlalchemy import insert, select, update
 
         t = entry.tables().tables["claim"]
-        with self._ledger._writing_alone(_LOCK) as (c, now):
+        with self._ledger._leasing() as (c, now):
             self._give_back(c)
             held = {row.key: row for row in c.execute(select(t.c.key, t.c.owner, t.c.heartbeat_at))}
             fresh = {key: row.owner for key, row in held.items() if abs(now - row.heartbeat_at) <= LIMIT_S}
@@ -77,7 +76,7 @@ class Leases:
         if self._held and time.monotonic() - self._beat_at > HEARTBEAT_S:
             self._beat_at = time.monotonic()
             t = entry.tables().tables["claim"]
-            with self._ledger._writing_alone(_LOCK) as (c, now):
+            with self._ledger._leasing() as (c, now):
                 self._give_back(c)
                 c.execute(update(t).where(t.c.owner == self.owner).values(heartbeat_at=now))
 
@@ -86,7 +85,7 @@ class Leases:
         from sqlalchemy import delete, or_
 
         t = entry.tables().tables["claim"]
-        with self._ledger._writing_alone(_LOCK) as (c, now):
+        with self._ledger._leasing() as (c, now):
             c.execute(delete(t).where(or_(t.c.owner == self.owner, t.c.heartbeat_at < now - _FORGOTTEN_S)))
 
 

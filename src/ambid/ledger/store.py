@@ -69,7 +69,8 @@ class KnownBearing:
     last: float
 
 
-_MOVING = 7281002  # lock of a server, held by who corrects a ledger
+_MOVING = 7281002  # lock of a server, held by who corrects a ledger, shared by who writes
+_LEASES = 7281003  # by who takes leases: rows of two statements are locked in no certain order
 
 
 class Ledger:
@@ -547,15 +548,15 @@ class Ledger:
             yield c
 
     @contextmanager
-    def _writing_alone(self, lock: int) -> Iterator[tuple[Connection, float]]:
-        """Yield a transaction that is alone under its number, and the time, s since 1970: the server's where there is
-        one.
+    def _leasing(self) -> Iterator[tuple[Connection, float]]:
+        """Yield a transaction beside which no other takes leases, and the time, s since 1970: the server's where there
+        is one.
         """
         with self._writing() as c:
             if not self._postgres:
                 yield c, time.time()
                 return
-            c.exec_driver_sql(f"SELECT pg_advisory_xact_lock({lock})")
+            c.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LEASES})")
             yield c, c.exec_driver_sql("SELECT extract(epoch FROM clock_timestamp())::float8").scalar_one()
 
     @contextmanager
