@@ -15,7 +15,7 @@ from ambid.record import Channel, Record
 from ambid.rig import rig_of_preset
 from ambid.rotor.passage import changes_speed, displacements, track_passage, whirl_of
 from ambid.rotor.passage_fit import answers
-from ambid.rotor.resonance import Resonance, SeparationRule, peaks, resonances, scaled_to_limit, separations
+from ambid.rotor.resonance import Resonance, peaks, required_separation, resonances, scaled_to_limit, separations
 from ambid.rotor.whirl_points import whirl_points
 from ambid.simulation.plant import closed_loop_poles, excited_loop
 from ambid.simulation.rotor_bench import RotorBench
@@ -89,7 +89,7 @@ def test_whirl_and_orbit_follow_the_sense_in_which_the_rotor_turns():
         a = np.array([[4.0, -2.0j * sign]])
         w = whirl_of(a, np.ones((1, 2)), reverse=sign < 0)
         assert (w.forward[0], w.backward[0]) == pytest.approx((3.0, 1.0))
-        assert (w.major[0], w.minor[0], w.inclination[0]) == pytest.approx((4.0, 2.0, 0.0))
+        assert w.major[0] == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_ways_of_one_record_and_pulses_in_place_of_the_angle_show_the_same():
     for more in (("angle", turned % (2.0 * np.pi), "rad"), ("tacho", pulses, "V"), ("speed", w, "rad/s")):
         channels = tuple(Channel(name=n, unit=u, values=x) for n, x, u in (*positions, more))
         passage = track_passage(Record(rate_hz=RATE, channels=channels), PLANE)
-        assert [way.rising for way in passage.ways] == [True, False]
+        assert [way.speed[-1] > way.speed[0] for way in passage.ways] == [True, False]
         fit = resonances([passage])
         values.append(next(r for r in fit.resonances if not r.critically_damped).frequency.value)
         assert bool(fit.warnings) == (more[0] == "speed")
@@ -230,12 +230,6 @@ def test_what_cannot_be_tracked_is_refused():
     still = (*record.channels[:2], Channel(name="speed", unit="rad/s", values=np.full(record.n_samples, 1.0)))
     with pytest.raises(EstimationError, match="blocks of 8 turns"):
         track_passage(dataclasses.replace(record, channels=still), PLANE)
-    passage = track_passage(record, PLANE)
-    with pytest.raises(EstimationError, match="a slow roll needs 3"):
-        passage.rolled(1.0, 2.0)
-    rolled = passage.rolled(200.0, 500.0)
-    within = (rolled.speed >= 200.0) & (rolled.speed <= 500.0)
-    assert np.abs(rolled.amplitude[within].mean(axis=0)).max() < 1e-12
 
 
 def test_a_record_is_a_run_up_by_its_turns_and_the_range_of_its_speed():
@@ -251,15 +245,13 @@ def test_displacements_count_from_the_centre_with_the_offset():
     record = noisy(4.0, 50.0, 1200.0, 1)
     x, y, angle = record.channels
     moved = dataclasses.replace(x, values=x.values + 4e-5), dataclasses.replace(y, values=y.values - 3e-5), angle
-    (at,) = displacements(dataclasses.replace(record, channels=moved), PLANE)
     size = np.hypot(moved[0].values, moved[1].values)
-    assert at.largest == size.max() > 5e-5
-    assert at.offset == pytest.approx((4e-5, -3e-5), abs=1e-8)
-    assert at.vibration == pytest.approx(np.hypot(x.values, y.values).max(), rel=0.01)
+    assert displacements(dataclasses.replace(record, channels=moved), PLANE) == pytest.approx({"A": size.max()})
+    assert size.max() > 5e-5
     thrust = RotorModel(bearings=(Bearing(name="T", axes=("ax",), axial=True),))
     low = dataclasses.replace(x, values=x.values - 4e-5)
-    (along,) = displacements(dataclasses.replace(record, channels=(low,)), thrust)
-    assert along.largest == np.abs(low.values).max()
+    along = displacements(dataclasses.replace(record, channels=(low,)), thrust)
+    assert along == {"T": np.abs(low.values).max()}
 
 
 def number(value, sd=0.0):
@@ -269,17 +261,15 @@ def number(value, sd=0.0):
 def mode(speed, factor, sd=0.0):
     return Resonance(
         speed=number(speed, sd), amplification=number(factor), half_power=True, critically_damped=factor < 2.5,
-        frequency=number(speed), damping=number(0.5 / factor), pole=complex(-0.5 * speed / factor, speed), shape={},
-        forward=1.0, measured=None, plane="A",
+        frequency=number(speed), damping=number(0.5 / factor), forward=1.0, measured=None, plane="A",
     )  # fmt: skip
 
 
 def test_separation_follows_the_amplification_factor():
-    rule = SeparationRule()
-    assert rule.required(2.4, above=True) == rule.required(2.4, above=False) == 0.0
-    assert rule.required(4.0, above=False) == pytest.approx(0.17 * (1.0 - 1.0 / 2.5))
-    assert rule.required(4.0, above=True) == pytest.approx(0.10 + 0.17 * (1.0 - 1.0 / 2.5))
-    assert (rule.required(100.0, above=False), rule.required(100.0, above=True)) == (0.16, 0.26)
+    assert required_separation(2.4, above=True) == required_separation(2.4, above=False) == 0.0
+    assert required_separation(4.0, above=False) == pytest.approx(0.17 * (1.0 - 1.0 / 2.5))
+    assert required_separation(4.0, above=True) == pytest.approx(0.10 + 0.17 * (1.0 - 1.0 / 2.5))
+    assert (required_separation(100.0, above=False), required_separation(100.0, above=True)) == (0.16, 0.26)
     below, within, above, damped = separations(
         [mode(800.0, 4.0), mode(1100.0, 4.0), mode(1400.0, 4.0, sd=10.0), mode(1100.0, 2.0)], (1000.0, 1200.0)
     )

@@ -17,8 +17,6 @@ _ROSS = "ROSS, report.py, after API RP 684 (2nd edition) SP6.8.2"
 _TUTORIAL = "ROSS, tutorial on magnetic bearings"
 _LATERAL = "a published calculation after API 617 (8th edition) 6.8.2 and 6.9"
 _MICROMETRES, _SPEED = 25.4, 12_000.0  # of the limit of vibration: peak to peak at a speed in 1/min
-AMPLIFICATION = 2.5
-"""Factor below which a response counts as critically damped."""
 CLEARANCE_SHARE = 0.75
 """Of the smallest diametral clearance, up to which the scaled response may come, peak to peak."""
 

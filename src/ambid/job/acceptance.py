@@ -41,7 +41,6 @@ from ambid.settings.caller import setting
 from ambid.settings.calls import of_job
 
 _RPM = 30.0 / math.pi
-_NEAR = 0.03  # of the maximum speed, within which a record is one at it
 _FREQUENCIES = 200
 _SPEEDS, _BEYOND = 25, 1.1  # of the whirl
 _BLOCKS = 400  # of a run-up that are drawn
@@ -153,7 +152,7 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
         items=tuple(items), checks=_checks(machine, items), margins={name: m for name, (m, _) in loops.items()},
         stiffness=None if loop is None else _curves(machine, loop), estimate=e, clearance=machine.rig.clearance,
         runs=tuple(_run(name, p) for name, p in machine.passages.items()),
-        points=tuple(x for b in machine.steady for x in whirl_points(b.record, e.plant.at_speed(b.speed))),
+        points=tuple(x for b in machine.steady for x in whirl_points(b.record, e.plant.at_speed(b.speed), b.apart)),
         whirl=None if loop is None else whirl_lines(loop, np.linspace(0.0, _BEYOND * machine.fastest, _SPEEDS)),
         speeds=machine.speeds, calibration=_calibration(machine.rig), warnings=tuple(warnings),
         rig=rig_entry(machine.rig),

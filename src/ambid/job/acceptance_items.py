@@ -20,7 +20,7 @@ from ambid.control.acceptance import (
     stiffness_sd,
 )
 from ambid.control.closed import ClosedLoop
-from ambid.control.limits import AMPLIFICATION, CLEARANCE_SHARE, residual_unbalance, vibration_limit
+from ambid.control.limits import CLEARANCE_SHARE, residual_unbalance, vibration_limit
 from ambid.control.margins import Margins, synchronous
 from ambid.control.zones import DISPLACEMENT, ZONES, Grade
 from ambid.estimation.result import NORMAL_95
@@ -35,7 +35,7 @@ from ambid.rotor.balance import Machine as Rotor
 from ambid.rotor.balance import Turned
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of, whirl_of
-from ambid.rotor.resonance import Peak, Resonances, peaks, resonances, scaled_to_limit, separations
+from ambid.rotor.resonance import CRITICALLY_DAMPED, Peak, Resonances, peaks, resonances, scaled_to_limit, separations
 from ambid.rotor.synchronous import Separated, separate
 
 _RPM = 30.0 / math.pi
@@ -171,7 +171,7 @@ class Machine:
 
     def largest(self, b: Bench, bearing: Bearing) -> float:
         """Return the largest displacement in a bearing in any sample, m."""
-        return next(x.largest for x in displacements(b.record, self.estimate.plant) if x.plane == bearing.name)
+        return displacements(b.record, self.estimate.plant)[bearing.name]
 
     def load(self, plane: str) -> float | None:
         """Return the mass that the bearing in a plane carries, kg; None: it is no bearing's plane, or not of two."""
@@ -328,7 +328,7 @@ def _critical(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
             words += f"; {near.amplification:.3g} by the machine as identified"
         yield _item(
             "critical", f"amplification factor {k}", factor.value, factor.sd, "1", words,
-            limit=AMPLIFICATION, limits="amplification",
+            limit=CRITICALLY_DAMPED, limits="amplification",
         )  # fmt: skip
         if not r.critically_damped:
             place = "within" if x.actual == 0.0 else "above" if r.speed.value > top else "below"

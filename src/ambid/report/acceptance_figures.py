@@ -55,11 +55,15 @@ def figures(a: Acceptance, used: Sequence[Record]) -> dict[Part, list[Drawing]]:
     drawn: dict[Part, list[Drawing]] = {
         "sensitivity": [("Sensitivity", "", partial(_sensitivity, a))] if a.margins else [],
         "bearings": [("Stiffness and damping of the bearings", _FORCE, partial(_stiffness, a))] if a.stiffness else [],
-        "collocation": [("Bending modes along the shaft", _SHAPES, partial(_modes, a))] if a.estimate.modes else [],
     }
-    if a.estimate.synchronous:
-        drawn["vibration"] = [("Orbits", _ORBITS, partial(orbit_blocks, a.estimate))]
-        drawn["unbalance"] = [("Unbalance and its correction", "", partial(_balance, a))]
+    e = a.estimate
+    if e.modes:
+        planes = {place: e.numbers[place] for place in e.plant.places}
+        drawn["collocation"] = [("Bending modes along the shaft", _SHAPES, lambda: [shapes_block(planes, e.modes)])]
+    if e.synchronous:
+        drawn["vibration"] = [("Orbits", _ORBITS, partial(orbit_blocks, e))]
+        if (block := balance_block(e.synchronous)) is not None:
+            drawn["unbalance"] = [("Unbalance and its correction", "", lambda: [block])]
     runs: list[Drawing] = []
     if a.runs:
         runs = [("Bode plots of the run-ups", _BODE_SAYS, partial(_bodes, a)), ("Polar plots", "", partial(_polars, a))]
@@ -81,8 +85,6 @@ def _sensitivity(a: Acceptance) -> list[Block]:
 
 
 def _stiffness(a: Acceptance) -> list[Block]:
-    if a.stiffness is None:
-        return []
     sides = [[panel(_dynamic, a, what, height=2.6)] for what in ("stiffness", "damping")]
     return [Block(columns=sides, title="bearings: force on the rotor by its displacement", shared=False)]
 
@@ -108,16 +110,6 @@ def _dynamic(axes: Axes, a: Acceptance, what: str) -> None:
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel(f"{name} [{unit}]")
     head(axes, f"{name} of the bearings")
-
-
-def _modes(a: Acceptance) -> list[Block]:
-    e = a.estimate
-    return [shapes_block({p: e.numbers[p] for p in e.plant.places}, e.modes)] if e.modes else []
-
-
-def _balance(a: Acceptance) -> list[Block]:
-    block = balance_block(a.estimate.synchronous) if a.estimate.synchronous else None
-    return [] if block is None else [block]
 
 
 def _bodes(a: Acceptance) -> list[Block]:

@@ -1,10 +1,9 @@
-"""Run-up and coast-down of a rotor: its synchronous motion over the speed, whirl and orbits, slow roll, waterfall."""
+"""Run-up and coast-down of a rotor: its synchronous motion over the speed, whirl and orbits, waterfall."""
 
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from ambid.record import Record
 from ambid.rotor.synchronous import Source, angle_of_pulses
 from ambid.signals.orders import Orders, Waterfall, track_orders, waterfall
 
-_ROLLS = 3  # blocks that a slow roll needs
 _TURNS = 64  # that a run-up has; noise of a speed channel at rest makes none
 _RANGE = 0.2  # of the speed over its mean, from which a record is a run-up or a coast-down
 
@@ -62,17 +60,6 @@ class Whirl:
         """Half the major axis of the orbit, (n,), m."""
         return np.asarray(np.abs(self.forward) + np.abs(self.backward))
 
-    @property
-    def minor(self) -> Array:
-        """Half the minor axis, negative where the whirl is backward."""
-        return np.asarray(np.abs(self.forward) - np.abs(self.backward))
-
-    @property
-    def inclination(self) -> Array:
-        """Angle of the major axis from x to y, rad, between -pi/2 and pi/2."""
-        at = 0.5 * (np.angle(self.forward) + np.angle(self.backward))
-        return np.asarray((at + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Passage:
@@ -83,7 +70,6 @@ class Passage:
     orders: Orders
     source: Source
     reverse: bool  # whether the rotor turns from y to x
-    slow_roll: Complex  # (n_roles,), taken out of order 1; zero: nothing is
 
     @property
     def speed(self) -> Array:
@@ -91,19 +77,14 @@ class Passage:
         return self.orders.speed
 
     @property
-    def rising(self) -> bool:
-        """Whether the rotor runs up, over all."""
-        return bool(self.speed[-1] > self.speed[0])
-
-    @property
     def ways(self) -> tuple[Passage, ...]:
         """The run-ups and coast-downs in it, in their order."""
         return tuple(replace(self, orders=part) for part in self.orders.ways())
 
-    @cached_property
+    @property
     def amplitude(self) -> Complex:
-        """Synchronous amplitudes without slow roll, (n, n_roles), m: x(t) = Re a exp(j angle)."""
-        return np.asarray(self.orders.of(1)[0] - self.slow_roll)
+        """Synchronous amplitudes, (n, n_roles), m: x(t) = Re a exp(j angle)."""
+        return self.orders.of(1)[0]
 
     @property
     def sd(self) -> Array:
@@ -120,22 +101,6 @@ class Passage:
         """Return the whirl of a plane of `planes` over the speed."""
         x, y = next((x, y) for name, x, y in self.planes if name == plane)
         return whirl_of(self.amplitude[:, [x, y]], self.sd[:, [x, y]], reverse=self.reverse)
-
-    def rolled(self, low: float, high: float) -> Passage:
-        """Return the passage with the mean vector between two speeds, rad/s, taken out as slow roll.
-
-        In a magnetic bearing with an integrator the sensors' run-out shows less at low speed than it does above: what
-        is taken out there is a convention, and resonances are fitted without it.
-        """
-        within = (self.speed >= low) & (self.speed <= high)
-        if np.count_nonzero(within) < _ROLLS:
-            rpm = 30.0 / np.pi
-            raise EstimationError(
-                f"between {low * rpm:.4g} and {high * rpm:.4g} rpm there are {np.count_nonzero(within)} blocks of "
-                f"whole turns; a slow roll needs {_ROLLS}. Choose other speeds, or stay longer there"
-            )
-        mean = self.orders.of(1)[0][within].mean(axis=0)
-        return replace(self, slow_roll=mean)
 
 
 def whirl_of(amplitude: Complex, sd: Array, *, reverse: bool = False) -> Whirl:
@@ -171,7 +136,7 @@ def track_passage(record: Record, model: RotorModel, *, turns: int = 8, orders: 
     tracked = track_orders(y, turning.angle, record.rate_hz, turns=turns, orders=orders)
     return Passage(
         roles=roles, model=model, orders=tracked, source=turning.source,
-        reverse=bool(turning.angle[-1] < turning.angle[0]), slow_roll=np.zeros(len(roles), dtype=np.complex128),
+        reverse=bool(turning.angle[-1] < turning.angle[0]),
     )  # fmt: skip
 
 
@@ -197,32 +162,11 @@ def record_waterfall(
 # --- displacement from the centre -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Displacement:
-    """How far a plane of sensors is from the centre of its clearance in a record, as ISO 14839-2 counts it: zero to
-    peak, with the offset at rest.
+def displacements(record: Record, model: RotorModel) -> dict[str, float]:
+    """Return the largest displacement from zero of each of `sensor_planes`, √(x² + y²) in m, as ISO 14839-2 counts it:
+    zero to peak, with the offset at rest.
     """
-
-    plane: str  # as `sensor_planes`
-    largest: float  # of √(x² + y²), m
-    at_s: float
-    offset: tuple[float, ...]  # mean of each axis from the centre, m
-    vibration: float  # largest distance from that mean, m
-
-
-def displacements(record: Record, model: RotorModel, centre: float = 0.0) -> tuple[Displacement, ...]:
-    """Return the largest displacement of every plane; `centre`: reading of the positions at the centre of the
-    clearance, m.
-    """
-    every: list[Displacement] = []
-    for plane, roles in sensor_planes(model, record):
-        y = np.column_stack([record[role].values for role in roles]) - centre
-        size, mean = np.linalg.norm(y, axis=1), y.mean(axis=0)
-        at = int(np.argmax(size))
-        every.append(
-            Displacement(
-                plane=plane, largest=float(size[at]), at_s=at / record.rate_hz, offset=tuple(mean.tolist()),
-                vibration=float(np.linalg.norm(y - mean, axis=1).max()),
-            )
-        )  # fmt: skip
-    return tuple(every)
+    return {
+        plane: float(np.linalg.norm([record[role].values for role in roles], axis=0).max())
+        for plane, roles in sensor_planes(model, record)
+    }

@@ -75,7 +75,7 @@ class Course:
 
     @classmethod
     def of(cls, passage: Passage) -> Course:
-        """Return what is fitted: the synchronous amplitudes with what slow roll is in them."""
+        """Return what is fitted of a passage: its synchronous amplitudes."""
         orders = passage.orders
         amplitude, sd = orders.of(1)
         half = 0.5 * (orders.stop - orders.first).astype(np.float64) / orders.rate_hz

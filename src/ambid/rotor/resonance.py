@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,8 @@ from ambid.estimation.result import NORMAL_95
 from ambid.rotor.passage import Passage, whirl_of
 from ambid.rotor.passage_fit import Course, ModalFit, fitted, reweighted, with_another
 
+CRITICALLY_DAMPED = 2.5
+"""Amplification factor below which a mode is no critical speed (API 684)."""
 _STANDS_OUT = 0.01  # of the largest value, by which a peak rises above what is around it
 _APART = 1e-9  # of the highest speed, up to which two are one
 _BULGE = 1.05  # of a parabola over its highest point
@@ -25,6 +27,7 @@ _RESOLVED = 5.0  # blocks in which a mode has to stand out
 _GRID = 600  # speeds
 _DRAWS = 100  # of the response, for intervals
 _NEAR, _WIDTHS = 0.03, 1.5  # of the frequency, and damping ratios, within which a peak belongs to a pole
+_FACTORS = 1.0, 6.0  # by which a response is scaled, at least and at most
 _MISFIT = 2.0  # mean square of residuals over their variance from which the fit is doubtful
 
 
@@ -97,32 +100,25 @@ class Resonance:
     speed: EstimatedNumber  # critical speed, rad/s: where that response peaks; of a damped mode its natural frequency
     amplification: EstimatedNumber  # AF by the half-power points of that response, else 1/(2 damping ratio)
     half_power: bool  # whether it is by half-power points
-    critically_damped: bool  # AF below the limit (2.5 in API 684): no critical speed in its sense
+    critically_damped: bool
     frequency: EstimatedNumber  # |pole|, rad/s
     damping: EstimatedNumber  # ratio
-    pole: complex  # rad/s
-    shape: Mapping[str, complex]  # by position, largest 1: the motion that goes with the mode
-    forward: float | None  # part of the shape's power that whirls forward; None: of one plane
+    forward: float | None  # part of the power of its motion that whirls forward; None: of one plane
     measured: Peak | None  # the peak of the tracked response itself, as the longest way passed it
     plane: str  # whose response shows it most
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Resonances:
-    """What passages show: resonances, and the response to unbalance at constant speed that belongs to them."""
+    """What passages show."""
 
     resonances: tuple[Resonance, ...]  # by speed
-    speed: Array  # (n,), rad/s, a grid over the range
-    response: Complex  # (n, n_roles), to unbalance at constant speed, without run-out, m
-    roles: tuple[str, ...]
     misfit: float  # mean square of the residuals over their variance
     warnings: tuple[str, ...] = ()
 
 
-def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | None = None) -> Resonances:
-    """Return the resonances of passages of one machine, up or down; `least`: AF below which a mode is critically
-    damped; `modes`: how many are fitted, by default as many as the data ask for.
-    """
+def resonances(passages: Sequence[Passage]) -> Resonances:
+    """Return the resonances of passages of one machine, up or down, by as many modes as the data ask for."""
     passages = [way for p in passages for way in p.ways]
     courses, fewest = [Course.of(p) for p in passages], min((p.speed.size for p in passages), default=0)
     if fewest < _BLOCKS:
@@ -130,13 +126,12 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
             f"a run-up has {fewest} blocks of whole turns; resonances need {_BLOCKS}. Run up more slowly, or further"
         )
     fit = fitted(courses, np.zeros(0, dtype=np.complex128))
-    while fit.poles.size < min(_MODES if modes is None else modes, fewest // _BLOCKS * 2):
+    while fit.poles.size < min(_MODES, fewest // _BLOCKS * 2):
         more = with_another(fit)
         numbers = 3 + 4 * sum(c.amplitude.shape[1] for c in courses)
         narrow = [int(np.sum(-p.real < _SMOOTH * np.abs(p))) for p in (fit.poles, more.poles)]
         each = np.log(fit.size) if narrow[1] > narrow[0] else _WORTH  # noise looks like narrow ones more often
-        worth = numbers * each * max(more.misfit, 1.0)
-        if modes is None and fit.cost - more.cost < worth:
+        if fit.cost - more.cost < numbers * each * max(more.misfit, 1.0):
             break
         fit = more
     misfit, fit = fit.misfit, reweighted(fit)
@@ -149,15 +144,13 @@ def resonances(passages: Sequence[Passage], *, least: float = 2.5, modes: int | 
     passage, modal, unsure = passages[first], [], []
     for r in np.argsort(np.abs(fit.poles)):
         if low <= np.abs(fit.poles[r]) <= high:
-            one = _resonance(fit, int(r), passage, first, speed, response, draws, least)
+            one = _resonance(fit, int(r), passage, first, speed, response, draws)
             if one.damping.sd < _SEEN * one.damping.value and fit.blocks(int(r)) > _RESOLVED:
                 modal.append(one)
             elif one.damping.value < _SMOOTH:
                 unsure.append(one)
-    return Resonances(
-        resonances=tuple(modal), speed=speed, response=response, roles=passage.roles, misfit=misfit,
-        warnings=tuple(_warnings(fit.poles.size, misfit, passages, unsure)),
-    )  # fmt: skip
+    warnings = tuple(_warnings(fit.poles.size, misfit, passages, unsure))
+    return Resonances(resonances=tuple(modal), misfit=misfit, warnings=warnings)
 
 
 def _grid(poles: Complex, low: float, high: float) -> Array:
@@ -178,9 +171,8 @@ def _majors(passage: Passage, response: Complex) -> dict[str, Array]:
 
 
 def _resonance(
-    fit: ModalFit, r: int, passage: Passage, course: int, speed: Array, response: Complex, draws: list[Complex],
-    least: float,
-) -> Resonance:  # fmt: skip
+    fit: ModalFit, r: int, passage: Passage, course: int, speed: Array, response: Complex, draws: list[Complex]
+) -> Resonance:
     """Return what is known of one pole."""
     s, residues = complex(fit.poles[r]), fit.weights[course][r]
     own = fit.covariance[3 * r : 3 * r + 2, 3 * r : 3 * r + 2]
@@ -212,12 +204,10 @@ def _resonance(
     x, y = (np.array([residues[p[k]] for p in passage.planes]) for k in (1, 2))
     y = -y if passage.reverse else y
     forward, backward = float(np.sum(np.abs(x + 1j * y) ** 2)), float(np.sum(np.abs(x - 1j * y) ** 2))
-    largest = residues[int(np.argmax(np.abs(residues)))]
     passed = close(_majors(passage, passage.amplitude)[plane], passage.speed)  # noise may split its top
     return Resonance(
-        speed=at, amplification=factor, half_power=by_points, critically_damped=factor.value < least,
-        frequency=frequency, damping=damping, pole=s,
-        shape={role: complex(v / largest) for role, v in zip(passage.roles, residues, strict=True)},
+        speed=at, amplification=factor, half_power=by_points, critically_damped=factor.value < CRITICALLY_DAMPED,
+        frequency=frequency, damping=damping,
         forward=forward / (forward + backward) if passage.planes else None,
         measured=max(passed, key=lambda p: p.size, default=None), plane=plane,
     )  # fmt: skip
@@ -251,27 +241,14 @@ def _warnings(modes: int, misfit: float, passages: Sequence[Passage], unsure: Se
 # --- margins ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeparationRule:
-    """How far a critical speed has to be from the operating speeds: a mode with AF of at least `least` by
-
-        base + slope (1 - 1/(AF - offset)), at most `most`,
-
-    over the speed that it is near, each below the operating range and above it.
+def required_separation(amplification: float, *, above: bool) -> float:
+    """Return how far a critical speed has to be from the operating speed that it is near, below the operating range or
+    above it, over that speed; 0 of a critically damped mode.
     """
-
-    least: float = 2.5
-    slope: float = 0.17
-    offset: float = 1.5
-    below: tuple[float, float] = (0.0, 0.16)  # base and most, of a critical speed below the lowest operating speed
-    above: tuple[float, float] = (0.10, 0.26)
-
-    def required(self, amplification: float, *, above: bool) -> float:
-        """Return the separation that is required, over the speed that it is near; 0 of a critically damped mode."""
-        if amplification < self.least:
-            return 0.0
-        base, most = self.above if above else self.below
-        return min(base + self.slope * (1.0 - 1.0 / (amplification - self.offset)), most)
+    if amplification < CRITICALLY_DAMPED:
+        return 0.0
+    base, most = (0.10, 0.26) if above else (0.0, 0.16)
+    return min(base + 0.17 * (1.0 - 1.0 / (amplification - 1.5)), most)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -286,18 +263,15 @@ class Separation:
     sd: float  # of the actual one
 
 
-def separations(
-    resonances: Sequence[Resonance], operating: tuple[float, float], rule: SeparationRule | None = None
-) -> tuple[Separation, ...]:
+def separations(resonances: Sequence[Resonance], operating: tuple[float, float]) -> tuple[Separation, ...]:
     """Return the margin of each resonance to the lowest and highest operating speed, rad/s."""
-    rule, margins = rule or SeparationRule(), []
-    low, high = operating
+    margins, (low, high) = [], operating
     for one in resonances:
         at, above = one.speed, one.speed.value > high
         near = high if above else low
         actual = 0.0 if low <= at.value <= high else abs(at.value - near) / near
         factor = one.amplification
-        required, most = (rule.required(x, above=above) for x in (factor.value, factor.ci95[1]))
+        required, most = (required_separation(x, above=above) for x in (factor.value, factor.ci95[1]))
         sd = at.sd / near
         margins.append(
             Separation(
@@ -313,19 +287,14 @@ class Scaled:
     """A measured response to unbalance, multiplied so that it reaches a limit in the operating range."""
 
     factor: float
-    at: float  # speed in the operating range at which it reaches the limit, rad/s
     largest: float  # zero to peak over all speeds, scaled, m
     largest_at: float  # rad/s
-    room: float  # what it may be, m
     passed: bool
 
 
-def scaled_to_limit(
-    speed: Array, size: Array, operating: tuple[float, float], limit: float, room: float,
-    factors: tuple[float, float] = (1.0, 6.0),
-) -> Scaled:  # fmt: skip
-    """Scale a response (n,), zero to peak in m, so that its largest in the operating range is `limit`, by a factor
-    within `factors`, and compare its largest at any speed with `room`.
+def scaled_to_limit(speed: Array, size: Array, operating: tuple[float, float], limit: float, room: float) -> Scaled:
+    """Scale a response (n,), zero to peak in m, so that its largest in the operating range is `limit`, by a factor from
+    1 to 6, and compare its largest at any speed with `room`.
     """
     inside = (speed >= operating[0]) & (speed <= operating[1])
     if not inside.any():
@@ -334,9 +303,6 @@ def scaled_to_limit(
             f"the passage has no speed between {operating[0] * rpm:.5g} and {operating[1] * rpm:.5g} rpm; the response "
             "is scaled there. Run up to the operating speed"
         )
-    k, top = int(np.argmax(np.where(inside, size, -np.inf))), int(np.argmax(size))
-    factor = float(np.clip(limit / size[k], *factors))
-    return Scaled(
-        factor=factor, at=float(speed[k]), largest=factor * float(size[top]), largest_at=float(speed[top]), room=room,
-        passed=factor * float(size[top]) <= room,
-    )  # fmt: skip
+    top, factor = int(np.argmax(size)), float(np.clip(limit / size[inside].max(), *_FACTORS))
+    largest = factor * float(size[top])
+    return Scaled(factor=factor, largest=largest, largest_at=float(speed[top]), passed=largest <= room)

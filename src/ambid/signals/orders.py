@@ -24,6 +24,7 @@ _TURNS_BACK = 0.1  # of the highest speed, by which a run-up becomes a coast-dow
 _AROUND, _FEW = 15, 4  # blocks on either side that show the noise, at most and at least
 _ALIKE = 0.25  # of the speed, within which the noise is the same
 _TOP = 0.45  # of the rate, up to which an order is tracked
+_RESOLUTION_HZ = 5.0  # of a waterfall
 _DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)  # what is smooth over five blocks drops out
 
 
@@ -33,23 +34,16 @@ class Orders:
 
     first: NDArray[np.int64]  # (n_blocks,), first sample of each block
     stop: NDArray[np.int64]
-    time_s: Array  # (n_blocks,), of the middle
     speed: Array  # (n_blocks,), mean of the block, rad/s, positive
     acceleration: Array  # (n_blocks,), rad/s²
     orders: tuple[int, ...]
     amplitude: Complex  # (n_blocks, n_orders, n_channels), mean over the block
     sd: Array  # (n_blocks, n_orders, n_channels), of real and of imaginary part
-    mean: Array  # (n_blocks, n_channels)
     rate_hz: float
-
-    @property
-    def bandwidth_hz(self) -> Array:
-        """What a block resolves, one over its length: (n_blocks,)."""
-        return np.asarray(self.rate_hz / (self.stop - self.first))
 
     def part(self, blocks: slice) -> Orders:
         """Return some blocks."""
-        arrays = ("first", "stop", "time_s", "speed", "acceleration", "amplitude", "sd", "mean")
+        arrays = ("first", "stop", "speed", "acceleration", "amplitude", "sd")
         return replace(self, **{name: getattr(self, name)[blocks] for name in arrays})
 
     def ways(self) -> tuple[Orders, ...]:
@@ -95,9 +89,8 @@ def track_orders(
     at = 2 + 2 * np.arange(len(used))
     amplitude = solved[:, at] + 1j * solved[:, at + 1]
     return Orders(
-        first=first, stop=stop, time_s=time, speed=speed,
-        acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude, sd=_scatter(amplitude, length, speed),
-        mean=solved[:, 0], rate_hz=rate_hz,
+        first=first, stop=stop, speed=speed, acceleration=np.gradient(speed, time), orders=used, amplitude=amplitude,
+        sd=_scatter(amplitude, length, speed), rate_hz=rate_hz,
     )  # fmt: skip
 
 
@@ -187,20 +180,18 @@ class Waterfall:
     """Amplitude spectra of channels over the speed."""
 
     speed: Array  # (n_spectra,), rad/s, mean of each spectrum's samples
-    time_s: Array  # (n_spectra,), of the middle
     frequency_hz: Array  # (n_frequencies,)
     amplitude: Array  # (n_spectra, n_frequencies, n_channels), of a sine, Hann window
 
 
 def waterfall(
-    y: Array, speed: Array, rate_hz: float, *, spectra: int = 120, highest_hz: float | None = None,
-    resolution_hz: float = 5.0,
-) -> Waterfall:  # fmt: skip
-    """Return `spectra` evenly over the record of channels (n_samples, n_channels), each as long as it resolves
-    `resolution_hz`; `speed` (n_samples,), rad/s.
+    y: Array, speed: Array, rate_hz: float, *, spectra: int = 120, highest_hz: float | None = None
+) -> Waterfall:
+    """Return `spectra` evenly over the record of channels (n_samples, n_channels), each as long as it resolves 5 Hz;
+    `speed` (n_samples,), rad/s.
     """
     n = y.shape[0]
-    size = min(n, max(16, round(2.0 * rate_hz / resolution_hz)))  # two bins: the half width of the window
+    size = min(n, max(16, round(2.0 * rate_hz / _RESOLUTION_HZ)))  # two bins: the half width of the window
     starts = np.unique(np.linspace(0, n - size, max(1, spectra)).round().astype(np.int64))
     window = np.hanning(size + 1)[:-1]
     frequency: Array = np.arange(size // 2 + 1, dtype=np.float64) * (rate_hz / size)
@@ -212,5 +203,5 @@ def waterfall(
         amplitude[k] = 2.0 / window.sum() * np.abs(lines)
     return Waterfall(
         speed=np.array([np.mean(np.abs(speed[a : a + size])) for a in starts]),
-        time_s=(starts + 0.5 * size) / rate_hz, frequency_hz=frequency[:top], amplitude=amplitude,
+        frequency_hz=frequency[:top], amplitude=amplitude,
     )  # fmt: skip
