@@ -81,6 +81,11 @@ def needs(package: str, what: str, extra: str) -> Iterator[None]:
         raise CircumstanceError(f"{package} is not installed, and {what} needs it. Install ambid[{extra}]") from None
 
 
+def listed(names: Sequence[str], most: int) -> str:
+    """Return names with commas, and how many more there are than `most`: ``a, b and 3 more``."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def counted(n: float | str, noun: str) -> str:
     """Return a number of things, as in ``1 sample``, ``2 samples``, ``3.25 samples``; a number may be text already."""
     text = f"{n:.3g}" if isinstance(n, float) else str(n)

@@ -15,7 +15,6 @@ from ambid.settings.caller import command, setting
 group = typer.Typer(
     rich_markup_mode=None, no_args_is_help=False, help="Check, back up, restore, merge and thin a ledger."
 )
-_DAY_S = 86400.0
 
 
 @group.command("check", short_help="check that a ledger is whole")
@@ -100,8 +99,9 @@ def retain(v: Values) -> None:
     What moves is in the archive first. A row of each estimate stays, so that a fleet does not do its record again.
     """
     from ambid.ledger import open_ledger
+    from ambid.ledger.rules import DAY_S
 
     with open_ledger(v.ledger, make=False) as ledger:
-        before = time.time() - _DAY_S * v.older_than
+        before = time.time() - DAY_S * v.older_than
         done = ledger.retain(v.out, before=before, keep=v.keep, who=v.who or "", why=v.why or "")
         typer.echo(f"{ledger.shown}: {done.text}. Undo: ambid ledger merge {ledger.shown} {v.out}")

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from ambid.errors import counted
+from ambid.errors import counted, listed
 from ambid.ledger.entry import key_of
 
 if TYPE_CHECKING:
@@ -57,8 +57,7 @@ def _faults(c: Connection) -> Iterator[str]:
 
 def _told(estimates: list[int], what: str) -> Iterator[str]:
     if estimates:
-        named = ", ".join(map(str, estimates[:_MOST])) + (" …" if len(estimates) > _MOST else "")
-        yield f"{counted(len(estimates), 'estimate')} with {what}: number {named}"
+        yield f"{counted(len(estimates), 'estimate')} with {what}: number {listed([*map(str, estimates)], _MOST)}"
 
 
 def _sound(packed: bytes) -> bool:

@@ -12,7 +12,7 @@ from ambid.errors import counted
 from ambid.ledger import correcting
 from ambid.ledger.entry import ARCHIVED, OWN, Correction, tables
 from ambid.ledger.history import superseded
-from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in, estimate_numbers, insert_new
+from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in, estimate_numbers, insert_new, put
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -101,7 +101,7 @@ def copy(source: Connection, c: Connection, only: Collection[str] | None = None)
 
 def _copy_bearing(source: Connection, c: Connection, bearing: Any, only: frozenset[str] | None) -> list[str]:
     """Copy the estimates of one bearing that are not there, and fill those of which only the row is."""
-    from sqlalchemy import bindparam, select, update
+    from sqlalchemy import select
 
     t = tables().tables
     query = select(t["estimate"]).where(t["estimate"].c.bearing == bearing.id).order_by(t["estimate"].c.id)
@@ -120,10 +120,7 @@ def _copy_bearing(source: Connection, c: Connection, bearing: Any, only: frozens
     to = {row.id: targets[places[row.id][0]] for row in rows}
     at = {row.id: places[row.id][1] if places[row.id][1] is not None else row.taken_at for row in rows}
     copy_in(c, t["estimate"], [(numbers[row.id], to[row.id], at[row.id], *row[3:]) for row in fresh])
-    filled = [{"number": numbers[r.id], "to": to[r.id], "time": at[r.id]} for r in rows if r.key in there]
-    if filled:
-        one = update(t["estimate"]).where(t["estimate"].c.id == bindparam("number"))
-        c.execute(one.values(bearing=bindparam("to"), taken_at=bindparam("time")), filled)
+    put(c, ((numbers[r.id], to[r.id], at[r.id]) for r in rows if r.key in there))
     values = source.execute(select(t["value"]).where(t["value"].c.bearing == bearing.id))
     copy_in(c, t["value"], [(to[r[3]], r[1], at[r[3]], numbers[r[3]], *r[4:]) for r in values if r[3] in to])
     later = {row.id: at[row.id] - row.taken_at for row in rows}

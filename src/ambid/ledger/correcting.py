@@ -14,10 +14,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import AmbidError, counted, nearest
+from ambid.errors import AmbidError, counted, listed, nearest
 from ambid.ledger.entry import ARCHIVED, OWN, REMOVED, Correction, day, tables
 from ambid.ledger.history import bearing_of
-from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in
+from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in, put
 from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def undo(c: Connection, ledger: str, number: int, **about: str) -> Correction:
     if row is None:
         raise AmbidError(
             f"{setting('undo', number)}: ledger {ledger} has no such correction; it has "
-            f"{_some([str(x.id) for x in known]) or 'none'}. Correct it"
+            f"{listed([str(x.id) for x in known], _SHOWN) or 'none'}. Correct it"
         )
     moves = _back(c, json.loads(zlib.decompress(row.old)), row.at)
     own = [e for e in stored_by_key(c, moves) if (e.bearing, e.taken_at) != moves[e.key]]
@@ -215,9 +215,7 @@ def _move(c: Connection, source: int, moves: Mapping[int, tuple[int, float]]) ->
         if events:
             rows_ = [{"number": n, "to": moves[e][0], "time": moves[e][1] + later} for n, later, e in events]
             c.execute(one.values(bearing=bindparam("to"), at=bindparam("time")), rows_)
-    one = update(estimate).where(estimate.c.id == bindparam("number"))
-    rows_ = [{"number": number, "to": to, "time": at} for number, (to, at) in moves.items()]
-    c.execute(one.values(bearing=bindparam("to"), taken_at=bindparam("time")), rows_)
+    put(c, ((number, to, at) for number, (to, at) in moves.items()))
 
 
 def _follow(c: Connection, source: tuple[int, str], target: tuple[int, str]) -> None:
@@ -251,14 +249,14 @@ def estimates_of(c: Connection, ledger: str, bearing: str, record: str | None) -
         names = list(dict.fromkeys(e.record for e in own))
         near = nearest(record, names)
         raise AmbidError(
-            f"{asked}: {bearing!r} has no such record; it has {_some(names)}.{near} Give the name, or at least "
-            f"{_LEAST} digits of the SHA-256"
+            f"{asked}: {bearing!r} has no such record; it has {listed(names, _SHOWN)}.{near} Give the name, or at "
+            f"least {_LEAST} digits of the SHA-256"
         )
     records = {e.sha: f"{e.sha[:12]} of {day(e.taken_at)}" for e in of}
     if len(records) > 1:
         raise AmbidError(
             f"{asked}: {counted(len(records), 'record')} of {bearing!r} have that name: "
-            f"{_some(list(records.values()))}. Give the digits"
+            f"{listed(list(records.values()), _SHOWN)}. Give the digits"
         )
     return of
 
@@ -277,10 +275,6 @@ def stored(c: Connection, bearing: str = "", *, keys: Sequence[str] | None = Non
 def stored_by_key(c: Connection, keys: Iterable[str]) -> list[Stored]:
     """Return estimates by their keys; those that are not there are passed over."""
     return [e for some in chunks(list(keys)) for e in stored(c, keys=some)]
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
 
 
 def _counted(own: Sequence[Stored]) -> str:

@@ -306,8 +306,11 @@ def moment(text: str, name: str = "taken_at") -> float:
 
 
 def day(at: float) -> str:
-    """Write a time, s since 1970, as a date and time of UTC, to the minute."""
-    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M")
+    """Write a time, s since 1970, as a date and time of UTC, to the minute; of one beyond the calendar its year."""
+    try:
+        return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M")
+    except (ValueError, OverflowError, OSError):
+        return f"the year {1970 + at / (365.25 * 86400.0):.0f}"
 
 
 @cache

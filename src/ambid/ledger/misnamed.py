@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.ledger.alarm import Alarm
+from ambid.ledger.entry import day
 from ambid.ledger.history import History
-from ambid.ledger.missing import day, pauses, plausible
+from ambid.ledger.missing import Numbers, alarm_of, numbers_of, pauses, plausible
 from ambid.ledger.rules import RecordRule
 
 _FEW = 3  # estimates of a bearing that may be a slip of the pen
@@ -30,15 +31,9 @@ class _Habits:
     h: History
     t: Array
     usual_s: float
-    numbers: dict[int, dict[str, tuple[float, float]]] = field(default_factory=dict)  # value and sd, by estimate
+    numbers: dict[int, Numbers]  # by estimate
 
-    def __post_init__(self) -> None:
-        for name, s in self.h.measured.items():
-            for k, value, sd in zip(s.estimate.tolist(), s.value.tolist(), s.sd.tolist(), strict=True):
-                if math.isfinite(value):
-                    self.numbers.setdefault(k, {})[name] = value, sd
-
-    def distances(self, own: dict[str, tuple[float, float]], at: float) -> list[float]:
+    def distances(self, own: Numbers, at: float) -> list[float]:
         """Return how far numbers lie from the levels around a time, in standard deviations."""
         place, found = int(np.searchsorted(self.t, at)), []
         around = range(max(0, place - _BESIDE), min(self.t.size, place + _BESIDE))
@@ -53,7 +48,7 @@ class _Habits:
 
 def misnamed(histories: Sequence[History], now: float) -> Iterator[Alarm]:
     """Yield records that seem to be another bearing's."""
-    every = [_Habits(h, np.array([e.taken_at for e in h.estimates]), _usual(h)) for h in histories]
+    every = [_Habits(h, np.array([e.taken_at for e in h.estimates]), _usual(h), numbers_of(h)) for h in histories]
     hosts = [x for x in every if x.t.size >= _MANY and math.isfinite(x.usual_s)]
     if not hosts:
         return
@@ -66,12 +61,11 @@ def misnamed(histories: Sequence[History], now: float) -> Iterator[Alarm]:
             fits = [(w, host) for host in hosts if host is not x and (w := _fit(x, k, host, strange)) is not None]
             if fits:
                 host = min(fits, key=lambda fit: fit[0])[1].h
-                yield Alarm(
-                    bearing=x.h.bearing, parameter="", rule="name", kind="name", raised=e.taken_at, at=e.taken_at,
-                    at_from=e.taken_at, at_to=e.taken_at,
-                    cause=f"{e.record or 'the record'} of {day(e.taken_at)} seems to be of {host.bearing!r}: it has "
-                    "none then, and the numbers are its",
-                )  # fmt: skip
+                text = (
+                    f"{e.record or 'the record'} of {day(e.taken_at)} seems to be of {host.bearing!r}: it has none "
+                    "then, and the numbers are its"
+                )
+                yield alarm_of(x.h.bearing, "name", e.taken_at, e.taken_at, text)
 
 
 def _usual(h: History) -> float:

@@ -9,14 +9,14 @@ from bisect import bisect_left, insort
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import counted
+from ambid.errors import counted, listed
 from ambid.ledger.alarm import Alarm, RecordKind
+from ambid.ledger.entry import day
 from ambid.ledger.history import History, KnownEstimate, Series
 from ambid.ledger.rules import DAY_S, RecordRule
 
@@ -40,14 +40,7 @@ _PARTS = 40  # of a pause, in which the other bearings are looked at
 _ELSE = 0.1  # of their usual rate, below which they stand still
 _ENOUGH = 20  # records of theirs that show that rate
 _SHUT_S = 35.0 * DAY_S  # from which a shutdown is told
-
-
-def day(at: float) -> str:
-    """Write the day of a time, s since 1970; of one beyond the calendar its year."""
-    try:
-        return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d")
-    except (ValueError, OverflowError, OSError):
-        return f"the year {1970 + at / (365.25 * DAY_S):.0f}"
+Numbers = dict[str, tuple[float, float]]  # value and standard deviation by parameter
 
 
 def span(seconds: float) -> str:
@@ -111,18 +104,17 @@ def missing(
     good = [e for e in h.estimates if plausible(e, now)]
     odd = [e for e in h.estimates if not plausible(e, now)]
     if odd:
-        which = ", ".join(f"{e.record or 'a record'} in {day(e.taken_at)}" for e in odd[:_SHOWN])
-        more = f" and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
+        which = listed([f"{e.record or 'a record'} of {day(e.taken_at)}" for e in odd], _SHOWN)
         end = good[-1].taken_at if good else now
-        yield _alarm(h.bearing, "date", odd[0].taken_at, end, f"taken at an impossible time: {which}{more}")
+        yield alarm_of(h.bearing, "date", odd[0].taken_at, end, f"taken at an impossible time: {which}")
     found = pauses(np.array([e.taken_at for e in good]), rule)
     if good and now - good[-1].taken_at > found.overdue_s:
         last = good[-1].taken_at
         text = f"no estimate for {span(now - last)}{_usual(found)}"
-        yield _alarm(h.bearing, "stale", last, now, text, raised=last + found.overdue_s)
+        yield alarm_of(h.bearing, "stale", last, now, text, raised=last + found.overdue_s)
     for begin, due, end in found.long:
         text = f"no estimate for {span(end - begin)}{_usual(found)}"
-        yield _alarm(h.bearing, "stale", begin, end, text, raised=due, cleared=end)
+        yield alarm_of(h.bearing, "stale", begin, end, text, raised=due, cleared=end)
     yield from unusable(h.bearing, rule, good, failures, now)
     for s in series:
         yield from _unseen(h, s, rule, now)
@@ -133,10 +125,11 @@ def _usual(found: Pauses) -> str:
     return f", usually one every {span(found.usual_s)}" if found.usual_s is not None else ""
 
 
-def _alarm(
+def alarm_of(
     bearing: str, kind: RecordKind, at: float, to: float, text: str, *, parameter: str = "",
     raised: float | None = None, cleared: float | None = None,
 ) -> Alarm:  # fmt: skip
+    """Return an alarm about records, by default raised by the first of them."""
     return Alarm(
         bearing=bearing, parameter=parameter, rule=kind, raised=at if raised is None else raised, cleared=cleared,
         kind=kind, at=at, at_from=min(at, to), at_to=max(at, to), cause=text,
@@ -187,7 +180,7 @@ def unusable(
         did = "failed" if kind == "failed" else "gave nothing usable"
         text = f"{counted(len(run), 'record')} in succession {did}, {n} of them by {reason.replace(',', ', ')}"
         end = None if after is None else what[after][0]
-        yield _alarm(
+        yield alarm_of(
             bearing, kind, run[0][0], now if end is None else end, text, raised=what[reached][0], cleared=end,
         )  # fmt: skip
 
@@ -206,23 +199,28 @@ def _unseen(h: History, s: Series, rule: RecordRule, now: float) -> Iterator[Ala
     for first, reached, after in _runs([not_seen for _, not_seen in e], _USUALLY[0], rule):
         run = e[first:after]
         to = now if after is None else e[after][0]
-        yield _alarm(
+        yield alarm_of(
             h.bearing, "unseen", run[0][0], to, f"{counted(len(run), 'usable estimate')} in succession did not show it",
             parameter=s.name, raised=e[reached][0], cleared=None if after is None else to,
         )  # fmt: skip
+
+
+def numbers_of(h: History) -> dict[int, Numbers]:
+    """Return what each estimate of a history shows, by its place."""
+    numbers: dict[int, Numbers] = {}
+    for name, s in h.measured.items():
+        for k, value, sd in zip(s.estimate.tolist(), s.value.tolist(), s.sd.tolist(), strict=True):
+            if math.isfinite(value):
+                numbers.setdefault(k, {})[name] = value, sd
+    return numbers
 
 
 def _double(h: History, good: Sequence[KnownEstimate]) -> Iterator[Alarm]:
     """Yield estimates of one record, or of its copy, that both count: of one SHA-256, of the same numbers to the last
     digit, or of one time and numbers that are nearly the same.
     """
-    place = {id(e): k for k, e in enumerate(h.estimates)}
-    numbers: dict[int, dict[str, tuple[float, float]]] = {}
-    for s in h.measured.values():
-        for k, value, sd in zip(s.estimate.tolist(), s.value.tolist(), s.sd.tolist(), strict=True):
-            if math.isfinite(value):
-                numbers.setdefault(k, {})[s.name] = value, sd
-    before: dict[object, tuple[KnownEstimate, dict[str, tuple[float, float]]]] = {}
+    place, numbers = {id(e): k for k, e in enumerate(h.estimates)}, numbers_of(h)
+    before: dict[object, tuple[KnownEstimate, Numbers]] = {}
     for e in good:
         own = numbers.get(place[id(e)], {})
         keys: list[object] = [(e.job, e.taken_at)]
@@ -235,7 +233,7 @@ def _double(h: History, good: Sequence[KnownEstimate]) -> Iterator[Alarm]:
                     continue
             first, second = (f"{x.record or 'a record'} of {day(x.taken_at)}" for x in (other, e))
             text = f"one record stored twice: {first} and {second}"
-            yield _alarm(h.bearing, "double", e.taken_at, other.taken_at, text)
+            yield alarm_of(h.bearing, "double", e.taken_at, other.taken_at, text)
             break
         for key in keys:
             before.setdefault(key, (e, own))

@@ -69,6 +69,17 @@ def bearing_numbers(c: Connection, plants: Mapping[str, str]) -> dict[str, int]:
     }
 
 
+def put(c: Connection, places: Iterable[tuple[int, int, float]]) -> None:
+    """Put rows of estimates to bearings and times: numbers of estimate and bearing, time."""
+    from sqlalchemy import bindparam, update
+
+    t = entry.tables().tables["estimate"]
+    one = update(t).where(t.c.id == bindparam("number"))
+    rows = [{"number": number, "to": to, "time": at} for number, to, at in places]
+    if rows:
+        c.execute(one.values(bearing=bindparam("to"), taken_at=bindparam("time")), rows)
+
+
 def assignments(c: Connection, shas: Iterable[str]) -> dict[tuple[str, str], tuple[str, float | None]]:
     """Return what corrections said of records: bearing, and time if any, by SHA-256 and name under which each came."""
     from sqlalchemy import select

@@ -125,19 +125,16 @@ class Ledger:
             bearings = bearing_numbers(c, {e.bearing: e.rig_name for e in batch.values()})
             rigs = {e.rig_sha: {"sha": e.rig_sha, "name": e.rig_name, "text": _packed(e.rig)} for e in batch.values()}
             insert_new(c, t["rig"], [rigs[sha] for sha in sorted(rigs)])
-            first = estimate_numbers(c, len(batch))
-            new = dict(zip(first, batch.values(), strict=True))
+            new = dict(zip(estimate_numbers(c, len(batch)), batch.values(), strict=True))
             rows = [
                 {
-                    "id": number, "bearing": bearings[e.bearing], "key": key, "added_at": now,
-                    "failed": ",".join(e.failed),
+                    "id": number, "bearing": bearings[e.bearing], "added_at": now, "failed": ",".join(e.failed),
                     **{x: getattr(e, x) for x in _PLAIN},
                 }
-                for (key, e), number in zip(batch.items(), first, strict=True)
+                for number, e in new.items()
             ]  # fmt: skip
             insert_new(c, t["estimate"], rows)
-            there = _there(c, batch)
-            new = {number: e for number, e in new.items() if there[e.key] == number}
+            new = {e.number: new[e.number] for e in correcting.stored_by_key(c, batch) if e.number in new}
             copy_in(c, t["value"], [row for n, e in new.items() for row in _values(n, bearings[e.bearing], e)])
             insert_new(c, t["document"], [_document(n, e) for n, e in new.items() if e.document or e.covariance_names])
             insert_new(
@@ -591,18 +588,6 @@ class Ledger:
         return self._engine.dialect.name == "postgresql"
 
 
-def _there(c: Connection, keys: Iterable[str]) -> dict[str, int]:
-    """Return the numbers of estimates that are there, by key."""
-    from sqlalchemy import select
-
-    t = entry.tables().tables["estimate"]
-    return {
-        row.key: row.id
-        for some in chunks(list(keys))
-        for row in c.execute(select(t.c.key, t.c.id).where(t.c.key.in_(some)))
-    }
-
-
 def _as_corrected(c: Connection, entries: Mapping[str, Entry]) -> dict[str, Entry]:
     """Return entries by key, with bearing and time as corrections of their records said."""
     known = assignments(c, (e.sha for e in entries.values()))
@@ -616,7 +601,7 @@ def _as_corrected(c: Connection, entries: Mapping[str, Entry]) -> dict[str, Entr
 
 
 _PLAIN = (
-    "taken_at", "sha", "rig_sha", "settings", "version", "job", "record", "status", "verdict", "model",
+    "key", "taken_at", "sha", "rig_sha", "settings", "version", "job", "record", "status", "verdict", "model",
 )  # fmt: skip
 
 

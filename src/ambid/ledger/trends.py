@@ -133,18 +133,13 @@ class _Fits:
     chi: Mapping[str, float]
     after: int  # index of the first value after the step
     bend: float  # where the bend is, months
+    course: Mapping[str, Array]  # of line, bend and step: the shape of the change, without its size
     scale: float  # variance of what is left, at least 1
 
     def best(self, *kinds: str) -> str:
         """Return which of these fits best, its number of parameters counted (BIC)."""
         count = {"level": 1, "line": 2, "bend": 4, "step": 4}  # their dates are chosen among many
         return min(kinds, key=lambda k: self.chi[k] / self.scale + count[k] * math.log(self.y.size))
-
-    def course(self, kind: str) -> Array:
-        """Return the shape of a change, without its size."""
-        return {"line": self.x, "bend": np.maximum(self.x - self.bend, 0.0)}.get(
-            kind, (np.arange(self.x.size) >= self.after).astype(float)
-        )
 
 
 def _fits(v: Values) -> _Fits:
@@ -167,15 +162,13 @@ def _fits(v: Values) -> _Fits:
         "step": float(np.min(inner)),
     }  # fmt: skip
     bend = float(bends[int(np.argmin(chis))])
-    left = {
-        "line": y - np.polyval(_line(x, y, w)[0][::-1], x), "bend": y - _on(np.maximum(x - bend, 0.0), y, w),
-        "step": y - np.where(np.arange(y.size) < after, np.average(y[:after], weights=w[:after]),
-                             np.average(y[after:], weights=w[after:])),
-    }  # fmt: skip
-    e = left[min(left, key=lambda k: chi[k])] / sd
+    course = {"line": x, "bend": np.maximum(x - bend, 0.0), "step": (np.arange(x.size) >= after).astype(float)}
+    best = course[min(course, key=lambda k: chi[k])]
+    (a, b), *_ = _line(best, y, w)
+    e = (y - a - b * best) / sd
     follow = min(max(float(e[1:] @ e[:-1] / (e @ e)), 0.0), 0.95) if e @ e > 0 else 0.0
     scale = max(1.0, float(e @ e) / max(e.size - 3, 1)) * (1.0 + follow) / (1.0 - follow)
-    return _Fits(x=x, y=y, w=w, chi=chi, after=after, bend=bend, scale=scale)
+    return _Fits(x=x, y=y, w=w, chi=chi, after=after, bend=bend, course=course, scale=scale)
 
 
 def _bent(x: Array, y: Array, w: Array) -> Array:
@@ -194,11 +187,6 @@ def _line(x: Array, y: Array, w: Array) -> tuple[Array, Array, float]:
     theta: Any = inverse @ (A.T @ (w * y))
     e = y - A @ theta
     return theta, inverse, float(e @ (w * e))
-
-
-def _on(x: Array, y: Array, w: Array) -> Array:
-    theta, *_ = _line(x, y, w)
-    return np.asarray(theta[0] + theta[1] * x, dtype=float)
 
 
 def _step(v: Values, f: _Fits) -> tuple[float, float, float, float, float]:
@@ -246,7 +234,7 @@ def trend_of(h: History, s: Series, rules: Sequence[Rule]) -> Iterable[Trend]:
     kind = f.best("line", "bend", "step")
     beyond = 0.0
     if f.chi["level"] - f.chi[kind] > _PLAIN:
-        beyond, scale = beyond_wander(f.x, f.y, f.w, f.course(kind))
+        beyond, scale = beyond_wander(f.x, f.y, f.w, f.course[kind])
         f = replace(f, scale=scale)
     if beyond < _BEYOND[kind]:
         kind = "level"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambid.errors import counted
+from ambid.errors import counted, listed
 from ambid.report.document import Document, Lines, Section, grid, value_columns
 from ambid.report.drawing import BAND, BOUND, MEASURED, PREDICTED, Block, head, panel, said_panel, stacked
 from ambid.report.numbers import prefixed, quantity, sized
@@ -59,7 +59,7 @@ def fleet_sections(fleet: FleetRun) -> list[Section]:
     judged = ", ".join(f"{words[w]} {WORDS[w][0]}" for w in WORDS if words[w])
     failures = list[str]()
     for reason, records in list(f.failures.items())[:_REASONS]:
-        names = ", ".join(records[:_SHOWN]) + (f" and {len(records) - _SHOWN} more" if len(records) > _SHOWN else "")
+        names = listed(records, _SHOWN)
         failures += [f"{len(records)} x {reason}", f"    {names}"]
     more = len(f.failures) - _REASONS
     failures += [f"and {counted(more, 'reason')} more; {setting('json')} has them all"] if more > 0 else []

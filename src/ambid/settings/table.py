@@ -9,7 +9,7 @@ SETTINGS = (
         "acknowledge",
         "text",
         "RULE",
-        "Take note of an alarm of the bearing that stands, by its rule or parameter: it is shown with @who and @why, "
+        "Acknowledge an alarm of the bearing that stands, by its rule or parameter: it is shown with @who and @why, "
         "and returns when it grows, or is raised anew; with @until whatever the rule raises is silenced until then.",
     ),
     Setting("again", "text", "failed", "Do records again that failed before."),
@@ -111,13 +111,7 @@ SETTINGS = (
     Setting("duration", "positive", "S", "Length of each record, in s.", shown="as ambid simulate"),
     Setting("eddy", "switch", "", "With @identify_nonlinear: the force follows the current with a pole a/(s + a)."),
     Setting("estimate", "path", "E.json", "With @modes: compare them with the modes of a physical estimate (MAC)."),
-    Setting(
-        "every",
-        "switch",
-        "",
-        "Also estimates that do not count: of each record and job the one of the newest version does.",
-        long="all",
-    ),
+    Setting("every", "switch", "", "Also estimates that others of their record and job supersede.", long="all"),
     Setting("every_s", "positive", "S", "Reporting interval, in s of record.", default=0.01),
     Setting(
         "excitation",
@@ -490,9 +484,7 @@ SETTINGS = (
         "Part of the way to the limits of position and current that may be used.",
         default=0.3,
     ),
-    Setting(
-        "undo", "whole", "N", "Put back what correction N changed; the history of the bearing numbers them.", least=1
-    ),
+    Setting("undo", "whole", "N", "Put back what correction N changed; a history numbers them.", least=1),
     Setting("until", "text", "TIME", "With @acknowledge: when it is over, such as 2026-03-01T14:30, of UTC."),
     Setting("validate", "path", "RECORD2", "Validate on this record too, on all of it."),
     Setting("who", "text", "NAME", "Who does this.", shown="account and host"),
