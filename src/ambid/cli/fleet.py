@@ -27,8 +27,8 @@ group = typer.Typer(
 def run(v: Values) -> None:
     """Do a job on many records, each once, in processes of their own.
 
-    A record that ends its worker, or takes too long, is told as failed; all others are done. After Ctrl-C, a crash or
-    a power cut, the same command goes on where it was. Several at a time, also on several machines, share the work.
+    A record that ends its worker, or takes too long, counts as failed; all others are done. After Ctrl-C, a crash or
+    a power cut, the same command goes on where it was. Several runs at once, also on several machines, share the work.
     Exit codes: 0 all done; 3 some records failed, or --strict and not usable; 4 none succeeded; 2 refused before
     anything ran; 130 Ctrl-C.
     """

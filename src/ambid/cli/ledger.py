@@ -94,7 +94,7 @@ def merge(v: Values) -> None:
 @group.command("retain", short_help="move what is old into an archive")
 @verb("ledger retain")
 def retain(v: Values) -> None:
-    """Move estimates of old records into an archive, but for one a month of each bearing, or another --keep.
+    """Move estimates of old records into an archive; one a month of each bearing stays, or as --keep says.
 
     What moves is in the archive first. A row of each estimate stays, so that a fleet does not do its record again.
     """

@@ -14,13 +14,12 @@ from threading import Timer
 from typing import Any
 
 from ambid.errors import AmbidError, needs
-from ambid.fleet.pool import Done, attempt, one_thread_each
+from ambid.fleet.pool import Done, attempt, drawn, one_thread_each
 from ambid.settings.caller import Language, language, setting, speaking
 
 ALLOWED_FAILURES = 2  # workers that a task may have killed before it is held to be poison
 _AHEAD = 3  # batches on their way for each worker
 _BATCH_S, _BATCH = 1.0, 64  # a batch takes about so long, and has at most so many tasks
-_END = object()
 _GONE_S = 30.0  # without a worker, after which a cluster on this machine gets new ones
 _LOOK_S = 0.2  # how often a wait looks whether it should end
 
@@ -67,7 +66,7 @@ def _answers(
     while True:
         room = _AHEAD * max(1, len(client.nthreads() or (1,))) - len(on_their_way)
         while more and room > 0:
-            some, more = _drawn(tasks, max(1, min(_BATCH, int(_BATCH_S / mean_s))))
+            some, more = drawn(tasks, max(1, min(_BATCH, int(_BATCH_S / mean_s))))
             if not some:
                 break
             send(some, alone=False)
@@ -107,17 +106,6 @@ def _answers(
                 yield from (Done(task=task, failure=text) for task in some)
             else:
                 suspects.extend(some)
-
-
-def _drawn(tasks: Iterator[Any], most: int) -> tuple[list[Any], bool]:
-    """Return tasks as far as there are some at present, and whether more may come."""
-    some: list[Any] = []
-    while len(some) < most:
-        task = next(tasks, _END)
-        if task is None or task is _END:
-            return some, task is None
-        some.append(task)
-    return some, True
 
 
 def timed(job: Callable[[Any], Any], some: list[Any], limit_s: float, caller: Language) -> list[Done]:

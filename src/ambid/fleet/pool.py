@@ -40,6 +40,7 @@ _STILLBORN = 3  # workers in a row that died before they began
 
 
 _ATTEMPTS = count()  # of this process
+_END = object()
 
 
 def _read_only(mapping: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -110,6 +111,17 @@ def work(
         pool.end()
 
 
+def drawn(tasks: Iterator[Any], most: int) -> tuple[list[Any], bool]:
+    """Return tasks as far as there are some at present, and whether more may come."""
+    some: list[Any] = []
+    while len(some) < most:
+        task = next(tasks, _END)
+        if task is None or task is _END:
+            return some, task is None
+        some.append(task)
+    return some, True
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Worker:
     """A process and what it was given that it has not answered; the first of these is what it is at."""
@@ -137,7 +149,7 @@ class _Pool:
 
     def __init__(self, job: bytes, tasks: Iterator[Any], size: int, limit_s: float) -> None:
         self._job, self._size, self._limit_s = job, size, limit_s
-        self._tasks = zip(count(), tasks)
+        self._tasks, self._numbers = tasks, count()
         self._waiting: deque[tuple[int, Any]] = deque()
         self._suspects: deque[tuple[int, Any]] = deque()
         self._deaths: dict[int, int] = {}  # of suspects that were run alone
@@ -198,16 +210,8 @@ class _Pool:
 
     def _draw(self, most: int) -> list[tuple[int, Any]]:
         """Take tasks from what comes, as far as there are some at present."""
-        drawn: list[tuple[int, Any]] = []
-        while self._more and len(drawn) < most:
-            numbered = next(self._tasks, None)
-            if numbered is None:
-                self._more = False
-            elif numbered[1] is None:
-                break
-            else:
-                drawn.append(numbered)
-        return drawn
+        some, self._more = drawn(self._tasks, most) if self._more else ([], False)
+        return [(next(self._numbers), task) for task in some]
 
     def _start(self) -> None:
         context = get_context("spawn")

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -147,7 +147,7 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
         with suppress(OSError, TypeError):
             values["its code"] = hashlib.sha256(inspect.getsource(job).encode()).hexdigest()[:16]
     result = JobOf(job=job, settings=dict(settings), said="", stored=stored)
-    return JobOf(job=job, settings=dict(settings), said=settings_text(result.name, **values), stored=stored)
+    return replace(result, said=settings_text(result.name, **values))
 
 
 def check_settings(job: Job, settings: Mapping[str, Any], rigs: Sequence[Rig]) -> None:
