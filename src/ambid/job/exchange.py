@@ -272,21 +272,21 @@ def ross_script(estimate: RotorEstimate, about: list[str]) -> str:
     synchronous = abs(estimate.speed) or 2.0 * np.pi * _STILL
     end = 2.0 * np.pi * _HIGHEST / period
     whirl = np.unique([*np.geomspace(2.0 * np.pi * _STILL, end, _POINTS), synchronous])
-    K = _controllers(estimate, rig, whirl)
+    known = _stiffnesses(estimate, rig, whirl)
     planes = [theta[place] for place in plant.places]
     shaft = rig.shaft or _rigid(planes, theta)
     z = np.asarray(shaft.free_rotor(1, planes=[*planes, theta["z_cg"]]).z)
-    read = "the loop and the magnets" if K else "the magnets alone (no controller is known)"
+    read = "the loop and the magnets" if known else "the magnets alone (no controller is known)"
     of = "the drawing" if rig.shaft else "m, Id and Ip on a shaft that does not bend (no drawing is known)"
-    axes = {"frequency": "WHIRL", **({"speed": "SPEEDS"} if len(K) > 1 else {})}
+    axes = {"frequency": "WHIRL", **({"speed": "SPEEDS"} if len(known) > 1 else {})}
     return "\n".join([
         f'"""{about[0]}', "", *about[1:], "",
-        f"Shaft: {of}. Bearings: {read}, in ROSS 3 over whirl frequency{' and speed' * (len(K) > 1)}, in ROSS 2",
+        f"Shaft: {of}. Bearings: {read}, in ROSS 3 over whirl frequency{' and speed' * (len(known) > 1)}, in ROSS 2",
         f"synchronous, at {synchronous / (2.0 * np.pi):.6g} Hz; at other frequencies those are wrong.",
         'The identified plant, all frequencies, is state_space(): x\' = A x + B u, y = C x, SI, u late by DELAY.',
         '"""', "",
         "import numpy as np", "import ross as rs", "", f"SPEED = {estimate.speed!r}  # rad/s",
-        f"WHIRL = {whirl.tolist()}  # rad/s", f"SPEEDS = {sorted(K)}  # rad/s",
+        f"WHIRL = {whirl.tolist()}  # rad/s", f"SPEEDS = {sorted(known)}  # rad/s",
         f"INPUTS = {list(plant.inputs)}", f"OUTPUTS = {list(plant.outputs)}",
         f"DELAY = {[x * period for x in delays.tolist()]}  # s, by which each input acts late",
         f"STATES = {list(estimate.continuous.states)}",
@@ -300,7 +300,7 @@ def ross_script(estimate: RotorEstimate, about: list[str]) -> str:
         "    return rs.BearingElement(n=n, tag=tag, **there)",
         "", "", "def rotor():",
         '    """Return the rotor: shaft, discs, bearings."""', *_elements(shaft, z),
-        "    discs = [", *_discs(shaft, z), "    ]", "    bearings = [", *_bearings(estimate, K, whirl, z),
+        "    discs = [", *_discs(shaft, z), "    ]", "    bearings = [", *_bearings(estimate, known, whirl, z),
         "    ]", "    return rs.Rotor(shaft, discs, bearings)", "", "", "def state_space():",
         '    """Return A, B, C."""',
         *(f"    {x} = np.array({getattr(estimate.continuous, x).tolist()})" for x in "ABC"),
@@ -340,17 +340,16 @@ def _discs(shaft: Shaft, z: Array) -> list[str]:
     return [f"        rs.DiskElement(n={_node(z, d.z)}, m={d.m!r}, Id={d.Id!r}, Ip={d.Ip!r})," for d in shaft.discs]
 
 
-def _bearings(estimate: RotorEstimate, K: Mapping[float, Complex], whirl: Array, z: Array) -> list[str]:
+def _bearings(estimate: RotorEstimate, known: Mapping[float, Complex], whirl: Array, z: Array) -> list[str]:
     """Return the bearings, stiffness and damping of each axis over whirl frequency, by row over speed too."""
     theta, plant, lines = estimate.numbers, estimate.plant, []
     for b in plant.bearings:
         node = _node(z, theta["z_cg"] if b.axial else theta[f"{b.name}.z"])
-        words = {name: np.zeros((max(len(K), 1), whirl.size)) for name in ("kxx", "kyy", "cxx", "cyy")}
+        words = {name: np.zeros((max(len(known), 1), whirl.size)) for name in ("kxx", "kyy", "cxx", "cyy")}
         for plane, axis in zip("z" if b.axial else "xy", b.axes, strict=False):
             j = plant.axes.index(axis)
-            k = np.array([_stiffness(estimate, K[at], whirl, j) for at in sorted(K)] or [
-                np.full(whirl.size, theta[f"{axis}.k_x"], complex)
-            ])  # fmt: skip
+            k_x = np.full(whirl.size, theta[f"{axis}.k_x"], complex)
+            k = np.array([known[at][:, j] for at in sorted(known)] or [k_x])
             words |= {f"k{plane}{plane}": k.real, f"c{plane}{plane}": k.imag / whirl}
         lines.append(f"        bearing({node}, {b.name!r},")
         for name, x in words.items():
@@ -364,10 +363,12 @@ def _node(z: Array, at: float) -> int:
     return int(np.argmin(np.abs(z - at)))
 
 
-def _controllers(estimate: RotorEstimate, rig: Any, whirl: Array) -> dict[float, Complex]:
-    """Return the controller at whirl frequencies by speed, both in rad/s, (n, n_u, n_y), without sign: of the records
-    at each, or of the rig; empty where none is known.
+def _stiffnesses(estimate: RotorEstimate, rig: Any, whirl: Array) -> dict[float, Complex]:
+    """Return the dynamic stiffness of the bearings at whirl frequencies by speed, both in rad/s, (n, n_axes), with the
+    controller of the records at each, or of the rig; empty where none is known.
     """
+    from ambid.control.acceptance import dynamic_stiffness
+    from ambid.control.closed import ClosedLoop
     from ambid.job.closed_loop import controller_of, plant_of, spectra_of
     from ambid.rotor.synchronous import separate
 
@@ -376,37 +377,13 @@ def _controllers(estimate: RotorEstimate, rig: Any, whirl: Array) -> dict[float,
     for record, used in zip(estimate.records, estimate.used or (None,) * len(estimate.records), strict=True):
         speed = float(str(record["speed"])) if used is not None else estimate.speed
         spectra = None if used is None else spectra_of(separate(used, of, speed).record, of, speed)
+        plant = plant_of(estimate, rate, speed)
         try:
-            controller = controller_of(plant_of(estimate, rate, speed), rig, spectra)
+            controller = controller_of(plant, rig, spectra)
         except EstimationError:
             continue
+        stiffness = dynamic_stiffness(ClosedLoop(plant=plant, controller=controller, frequency_hz=hz))
         if controller.source == "rig":
-            return {abs(estimate.speed): controller.response(hz)[0]}
-        found[abs(speed)] = controller.response(hz)[0]
+            return {abs(estimate.speed): stiffness}
+        found[abs(speed)] = stiffness
     return found
-
-
-def _stiffness(estimate: RotorEstimate, K: Complex, whirl: Array, j: int) -> Complex:
-    """Return -f/x of one axis over frequency in rad/s, as if its sensors stood at the magnet.
-
-    i = -(K_x late + k_i s) x/(R + L s + K_i late) of a coil, f = k_i a/(s + a) i - k_x x.
-    """
-    theta, plant, axis = estimate.numbers, estimate.plant, estimate.plant.axes[j]
-    s = 1j * whirl
-    k_i, k_x = theta[f"{axis}.k_i"], theta[f"{axis}.k_x"]
-    pull = k_i * (theta["a"] / (s + theta["a"]) if "a" in plant.extras else 1.0)
-    rate = float(str(estimate.record["rate_hz"]))
-    delay = estimate.delay.get(plant.inputs[j])
-    samples = 0.0 if delay is None else delay.samples + delay.fraction
-    late = np.exp(-s * (samples + 0.5 * (plant.drive(j) != "current")) / rate)
-    rows = [k for k, (of, _) in enumerate(plant.sensors) if of == j]
-    by_position = K[:, j, rows].sum(axis=1) * late
-    if plant.drive(j) == "voltage":
-        row = plant.outputs.index(f"{axis}_current")
-        ratio = (by_position + k_i * s) / (theta[f"{axis}.R"] + theta[f"{axis}.L"] * s + K[:, j, row] * late)
-    elif plant.drive(j) == "command":
-        pole = theta[f"{axis}.amplifier_pole"]
-        ratio = theta[f"{axis}.amplifier_gain"] * pole / (s + pole) * by_position
-    else:
-        ratio = by_position
-    return np.asarray(k_x + pull * ratio)
