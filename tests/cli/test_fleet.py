@@ -1,5 +1,7 @@
 """``ambid fleet``: exit codes for schedulers, and what is refused before anything runs."""
 
+from importlib import import_module
+
 import pytest
 
 from ambid.ledger.store import FleetRow, FleetRun
@@ -24,7 +26,7 @@ def test_the_exit_code_says_how_many_failed(ambid, monkeypatch, states, strict, 
         for k, s in enumerate(states)
     )  # fmt: skip
     run = FleetRun(job="info", settings="{}", ledger="l.db", workers=1, seconds=1.0, records=2, units={}, rows=rows)
-    monkeypatch.setattr("ambid.fleet.run.run_fleet", lambda *_, **__: run)
+    monkeypatch.setattr(import_module("ambid.fleet.run"), "run_fleet", lambda *_, **__: run)
     assert ambid("fleet", "run", "x.h5", "--ledger", "l.db", *strict).code == code
 
 
