@@ -16,6 +16,7 @@ from ambid.rig import rig_of_preset
 from ambid.rotor.passage import changes_speed, displacements, track_passage, whirl_of
 from ambid.rotor.passage_fit import answers
 from ambid.rotor.resonance import Resonance, peaks, required_separation, resonances, scaled_to_limit, separations
+from ambid.rotor.synchronous import separate
 from ambid.rotor.whirl_points import whirl_points
 from ambid.simulation.plant import closed_loop_poles, excited_loop
 from ambid.simulation.rotor_bench import RotorBench
@@ -298,7 +299,7 @@ def test_noise_shows_the_bending_modes_at_constant_speed():
     bench = bench_of("utrc")
     z = closed_loop_poles(bench.plant.parameters, bench.loop, bench.rate_hz, of=bench.model)
     s = np.log(z[np.abs(z) > 1e-6].astype(complex)) * bench.rate_hz
-    points = whirl_points(run_of("utrc", 8.0, (15_000, 15_000)), bench.model)
+    points = whirl_points(separate(run_of("utrc", 8.0, (15_000, 15_000)), bench.model), bench.model)
     second = [p for p in points if 25_000.0 < p.frequency.value * RPM < 40_000.0]
     assert [p.direction for p in second] == [-1, 1]
     for p in second:

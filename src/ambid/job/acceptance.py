@@ -131,7 +131,7 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
     excited = [b for b in machine.steady if b.apart is not None and b.apart.excitation is not None]
     for b in excited or machine.steady:
         try:
-            loops[b.name] = margins_and_loop(e, machine.rig, b.record, b.speed)
+            loops[b.name] = margins_and_loop(e, machine.rig, b.record, b.apart)
         except AmbidError as error:
             warnings.append(f"{b.name}: no sensitivity: {error}")
     clock.lap("margins")
@@ -152,7 +152,7 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
         items=tuple(items), checks=_checks(machine, items), margins={name: m for name, (m, _) in loops.items()},
         stiffness=None if loop is None else _curves(machine, loop), estimate=e, clearance=machine.rig.clearance,
         runs=tuple(_run(name, p) for name, p in machine.passages.items()),
-        points=tuple(x for b in machine.steady for x in whirl_points(b.record, e.plant.at_speed(b.speed), b.apart)),
+        points=tuple(x for b in machine.steady if b.apart is not None for x in whirl_points(b.apart, e.plant)),
         whirl=None if loop is None else whirl_lines(loop, np.linspace(0.0, _BEYOND * machine.fastest, _SPEEDS)),
         speeds=machine.speeds, calibration=_calibration(machine.rig), warnings=tuple(warnings),
         rig=rig_entry(machine.rig),

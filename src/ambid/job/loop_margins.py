@@ -44,6 +44,7 @@ from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
 from ambid.rotor.balance import Machine
 from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.synchronous import Separated, separate
 from ambid.settings.caller import saved, setting
 from ambid.settings.calls import of_job
 
@@ -186,17 +187,14 @@ def given(estimate: Any, rig: RigSource | None) -> tuple[Numbers, Rig]:
 
 
 def margins_and_loop(
-    estimate: Numbers, rig: Rig, bench: Record | None, at_speed: float | None = None
+    estimate: Numbers, rig: Rig, bench: Record | None, apart: Separated | None = None
 ) -> tuple[Margins, ClosedLoop]:
     """Return the margins of an estimate's loop as a record shows it, None: as the rig says, and the loop itself;
-    `at_speed`: that of a rotor in the record, rad/s, where it is there already.
+    `apart`: of a rotor, the record without its synchronous part, where it is there already.
     """
     clean, speed = bench, estimate.speed if isinstance(estimate, RotorEstimate) else 0.0
     if bench is not None and isinstance(estimate, RotorEstimate):
-        from ambid.rotor.synchronous import separate
-
-        model_speed = 0.0 if rig.rotor is None else rig.rotor.speed
-        apart = separate(bench, estimate.plant.at_speed(model_speed), at_speed)
+        apart = apart or separate(bench, estimate.plant.at_speed(0.0 if rig.rotor is None else rig.rotor.speed))
         clean, speed = apart.record, apart.speed
     plant = model(estimate.model) if isinstance(estimate, Estimate) else estimate.plant
     spectra = None if clean is None else spectra_of(clean, plant, speed)

@@ -15,9 +15,8 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.estimation.modes import EstimatedNumber
 from ambid.physics.rotor_model import RotorModel
-from ambid.record import Record
 from ambid.rotor.passage import sensor_planes
-from ambid.rotor.synchronous import Separated, aperiodic, separate
+from ambid.rotor.synchronous import Separated, aperiodic
 
 _SEGMENTS = 16  # at least, of the averaged spectrum in which peaks are sought
 _STANDS_OUT = 2.0  # over the median of a band
@@ -47,21 +46,20 @@ class WhirlPoint:
     plane: str  # of sensors, or the axis
 
 
-def whirl_points(record: Record, model: RotorModel, apart: Separated | None = None) -> tuple[WhirlPoint, ...]:
-    """Return the modes that noise shows in a record at constant speed, by frequency; modes with a damping ratio above
-    0.2 make no peak, and are not sought. `apart`: the record without its synchronous part, where it is at hand.
+def whirl_points(apart: Separated, model: RotorModel) -> tuple[WhirlPoint, ...]:
+    """Return the modes that noise shows in a record at constant speed, its synchronous part apart, by frequency; modes
+    with a damping ratio above 0.2 make no peak, and are not sought.
     """
-    apart = apart or separate(record, model)
     clean, excitation, speed = apart.record, apart.excitation, apart.speed
     points: list[WhirlPoint] = []
-    for name, roles in sensor_planes(model, record):
+    for name, roles in sensor_planes(model, clean):
         y = np.column_stack([clean[role].values for role in roles])
         if excitation is not None:
             y = y[excitation.first : excitation.first + excitation.period * excitation.count]
             y = aperiodic(y, np.zeros(0, dtype=np.intp), excitation.count)
         z = y - y.mean(axis=0)
         motion = z[:, 0] + 1j * z[:, 1] if len(roles) == 2 else z[:, 0].astype(np.complex128)
-        points += _of_motion(motion, record.rate_hz, speed, name, two=len(roles) == 2)
+        points += _of_motion(motion, clean.rate_hz, speed, name, two=len(roles) == 2)
     points.sort(key=lambda p: p.frequency.sd / p.frequency.value)
     kept: list[WhirlPoint] = []
     for p in points:
