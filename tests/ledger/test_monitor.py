@@ -1,10 +1,12 @@
 """Alarms over years: found with cause and date, none without a fault, none from what is not usable; rules; telling."""
 
+import json
 import socket
 import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -175,6 +177,14 @@ def test_metrics_are_those_of_prometheus(watched, tmp_path):
     found = {f.name: f.samples for f in families}
     assert len(found["ambid_parameter"]) == 5 * len(watched.bearings)
     assert sum(x.value for x in found["ambid_alarm"]) == len(watched.open)
+
+
+def test_what_is_published_is_a_message_for_each_bearing(watched, monkeypatch):
+    client, broker = pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed"), MagicMock()
+    broker.connect.side_effect = lambda *_: broker.on_connect(0, 0, 0, MagicMock(is_failure=False))
+    monkeypatch.setattr(client, "Client", lambda *_, **__: broker)
+    assert publish(watched, "localhost/works") == len(watched.bearings)
+    assert [json.loads(call.args[1])["bearing"] for call in broker.publish.call_args_list] == list(watched.bearings)
 
 
 @pytest.mark.skipif(not MOSQUITTO.exists(), reason="Debian's package mosquitto, a broker, is not installed")

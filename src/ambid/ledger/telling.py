@@ -135,9 +135,9 @@ def publish(watched: Watched, where: str) -> int:
             client.publish(f"{topic.strip('/')}/{_plain(s.bearing)}", message(watched, s), qos=1, retain=True)
             for s in watched.states
         ]
-        for message in sent:
-            message.wait_for_publish(PATIENCE_S)
-        lost = sum(not message.is_published() for message in sent)
+        for one in sent:
+            one.wait_for_publish(PATIENCE_S)
+        lost = sum(not one.is_published() for one in sent)
         if lost:
             raise AmbidError(
                 f"{setting('publish', where)}: the broker did not confirm {counted(lost, 'message')}. Check it"
