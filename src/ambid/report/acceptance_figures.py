@@ -113,23 +113,20 @@ def _dynamic(axes: Axes, a: Acceptance, what: str) -> None:
 
 
 def _bodes(a: Acceptance) -> list[Block]:
-    return [
-        Block(
-            columns=[[panel(_bode, a, run, roles, what, height=h) for what, h in _BODE] for roles in planes.values()],
-            title=run.record,
-        )
-        for run, planes in ((run, _planes(a, run)) for run in a.runs)
-    ]  # fmt: skip
+    blocks = []
+    for run in a.runs:
+        sides = _planes(a, run).values()
+        columns = [[panel(_bode, a, run, roles, what, height=h) for what, h in _BODE] for roles in sides]
+        blocks.append(Block(columns=columns, title=run.record))
+    return blocks
 
 
 def _polars(a: Acceptance) -> list[Block]:
-    return [
-        Block(
-            columns=[[panel(_polar, run, roles, name, height=3.6)] for name, roles in planes.items()],
-            title=run.record, shared=False,
-        )
-        for run, planes in ((run, _planes(a, run)) for run in a.runs)
-    ]  # fmt: skip
+    blocks = []
+    for run in a.runs:
+        columns = [[panel(_polar, run, roles, name, height=3.6)] for name, roles in _planes(a, run).items()]
+        blocks.append(Block(columns=columns, title=run.record, shared=False))
+    return blocks
 
 
 def _falls(a: Acceptance, used: Sequence[Record]) -> list[Block]:
@@ -163,7 +160,7 @@ def _bode(axes: Axes, a: Acceptance, run: Run, roles: Sequence[str], what: str) 
             axes.plot(x, np.abs(run.amplitude[role]) / scale, label=role.rsplit("_", 1)[0])
         axes.set_ylabel(f"amplitude [{unit}]")
         axes.set_ylim(0.0, None)
-        head(axes, f"{' and '.join(role.rsplit('_', 1)[0] for role in roles)}")
+        head(axes, " and ".join(role.rsplit("_", 1)[0] for role in roles))
     else:
         for role in roles:
             axes.plot(x, np.degrees(np.unwrap(np.angle(run.amplitude[role]))))
