@@ -41,6 +41,12 @@ def test_every_part_of_the_report_says_something(spindle):
         assert x.words.endswith("would") or x.outcome != "missing", x
 
 
+def test_a_radial_clearance_says_nothing_along_the_shaft(spindle):
+    along = next(b.name for b in spindle.rig.rotor.bearings if b.axial)
+    (item,) = [x for x in spindle.accepted.of("vibration") if x.what.startswith(f"bearing {along},")]
+    assert (item.outcome, item.words) == ("missing", "a rig with operation.axial_touch_down would")
+
+
 def test_sensitivities_are_those_of_margins(spindle):
     items, known = spindle.accepted.of("sensitivity"), spindle.estimate.sensitivity
     assert [x.what.split()[1].rstrip(",") for x in items] == ["ax", "ay", "bx", "by", "az"]

@@ -166,8 +166,9 @@ class Machine:
 
     def clearance(self, *, axial: bool = False) -> float | None:
         """Return the radial clearance in the touch-down bearings, or that along the shaft, m."""
-        own = self.operation.axial_touch_down
-        return own if axial and own is not None else self.rig.clearance
+        if axial and (self.operation.touch_down is not None or self.operation.axial_touch_down is not None):
+            return self.operation.axial_touch_down  # of which the radial one says nothing
+        return self.rig.clearance
 
     def largest(self, b: Bench, bearing: Bearing) -> float:
         """Return the largest displacement in a bearing in any sample, m."""
