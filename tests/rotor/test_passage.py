@@ -18,6 +18,7 @@ from ambid.rotor.passage_fit import answers
 from ambid.rotor.resonance import Resonance, peaks, required_separation, resonances, scaled_to_limit, separations
 from ambid.rotor.synchronous import separate
 from ambid.rotor.whirl_points import whirl_points
+from ambid.signals.orders import track_orders
 from ambid.simulation.plant import closed_loop_poles, excited_loop
 from ambid.simulation.rotor_bench import RotorBench
 from tests.tiers import long, runs, sample
@@ -91,6 +92,14 @@ def test_whirl_and_orbit_follow_the_sense_in_which_the_rotor_turns():
         w = whirl_of(a, np.ones((1, 2)), reverse=sign < 0)
         assert (w.forward[0], w.backward[0]) == pytest.approx((3.0, 1.0))
         assert w.major[0] == pytest.approx(4.0)
+
+
+def test_phases_count_from_the_mark_wherever_the_record_begins():
+    t = np.arange(20_000) / RATE
+    for sense in (1.0, -1.0):
+        angle = 1.3 + sense * 2.0 * np.pi * (20.0 * t + 2.0 * t**2)
+        tracked = track_orders(np.cos(sense * angle + 0.4)[:, None], angle, RATE)
+        assert np.angle(tracked.of(1)[0]) == pytest.approx(0.4, abs=1e-6)
 
 
 @pytest.mark.parametrize(

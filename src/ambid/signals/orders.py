@@ -1,5 +1,5 @@
-"""Order tracking: the amplitudes a_k of x(t) = Re Σ_k a_k exp(j k angle(t)) while the speed changes, by least squares
-over blocks of whole turns; and the waterfall, spectra over the speed.
+"""Order tracking: the amplitudes a_k of x(t) = Re Σ_k a_k exp(j k angle(t)) while the speed changes, the angle counted
+so that it rises, by least squares over blocks of whole turns; and the waterfall, spectra over the speed.
 
 In a block order 1 may change linearly, so that its amplitude is the mean over the block whatever the acceleration.
 """
@@ -83,9 +83,10 @@ def track_orders(
             "Record faster"
         )
     solved = np.empty((first.size, 4 + 2 * len(used), y.shape[1]))
+    sense = -1.0 if angle[-1] < angle[0] else 1.0
     for part in _parts(first, stop):
         a, b = first[part][0], stop[part][-1]
-        solved[part] = _solved(y[a:b], np.abs(angle[a:b] - angle[0]), first[part] - a, stop[part] - a, used)
+        solved[part] = _solved(y[a:b], sense * angle[a:b], first[part] - a, stop[part] - a, used)
     at = 2 + 2 * np.arange(len(used))
     amplitude = solved[:, at] + 1j * solved[:, at + 1]
     return Orders(
