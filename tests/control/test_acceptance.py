@@ -61,6 +61,7 @@ def test_the_whirl_of_a_loop_splits_with_the_speed():
 def test_limits_are_those_of_the_standards():
     assert vibration_limit(12_000.0 * RPM) == pytest.approx(25.4e-6)
     assert vibration_limit(3_000.0 * RPM) == pytest.approx(50.8e-6)
+    assert vibration_limit(3_000.0 * RPM, running=True) == pytest.approx(25.4e-6)
     assert residual_unbalance(100.0, 6350.0 * RPM) == pytest.approx(100e-6)
     assert Grade.of_displacement(0.35, 0.0).letters == "B"
     assert Grade.of_displacement(0.31, 0.02).letters == "A or B"

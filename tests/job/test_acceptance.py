@@ -13,9 +13,12 @@ from ambid.control.acceptance import PARTS, dynamic_stiffness
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
 from ambid.errors import EstimationError
+from ambid.estimation.modes import EstimatedNumber
+from ambid.job.acceptance_items import Machine, _beside, _critical
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
 from ambid.rig.rotor import Operation
+from ambid.rotor.resonance import Peak, Resonance, Resonances
 from ambid.simulation.rotor_bench import RotorBench
 from ambid.simulation.variation import Schedule
 
@@ -123,6 +126,58 @@ def test_one_axis_is_refused():
     rig = rig_of_preset(preset("rmit-axis"))
     with pytest.raises(EstimationError, match="of one axis"):
         ambid.accept(ambid.simulate("rmit-axis", duration=0.2, seed=1), rig)
+
+
+def mode(speed, factor, sd):
+    """A resonance of a run-up, speed in rad/s."""
+    number = EstimatedNumber.of
+    return Resonance(
+        speed=number(speed, 0.1), amplification=number(factor, sd), half_power=True, critically_damped=factor < 2.5,
+        frequency=number(speed, 0.1), damping=number(0.5 / factor, 0.01), pole=-1.0 + 1j * speed, shape={}, forward=1.0,
+        measured=None, plane="A",
+    )  # fmt: skip
+
+
+def critical(*modes, fastest=2500.0):
+    found = Resonances(resonances=modes, speed=np.zeros(0), response=np.zeros((0, 0)), roles=(), misfit=1.0)
+    machine = SimpleNamespace(
+        resonances=found, speeds=(1800.0, 2000.0), passages={"run": SimpleNamespace(speed=np.array([fastest]))},
+        estimate=SimpleNamespace(synchronous={}),
+    )  # fmt: skip
+    return {x.what: x for x in _critical(machine, None)}
+
+
+def test_a_well_damped_mode_without_half_power_points_has_no_critical_speed():
+    damped = mode(1700.0, 1.2, 0.1)
+    damped = replace(damped, half_power=False, speed=replace(damped.speed, identifiable=False))
+    items = critical(damped)
+    assert not {"critical speed 1", "separation 1"} & set(items)
+    assert "too well damped" in items["amplification factor 1"].words
+
+
+def test_an_amplification_factor_that_may_be_above_the_limit_is_no_critical_damping():
+    item = critical(mode(1790.0, 2.45, 0.2))["separation 1"]
+    assert item.outcome == "doubt"
+    assert "separation 1" not in critical(mode(1790.0, 2.0, 0.1))
+
+
+def test_a_run_up_to_the_maximum_speed_ends_there():
+    assert "critical speeds up to the maximum" not in critical(fastest=1999.0)
+    assert critical(fastest=1900.0)["critical speeds up to the maximum"].outcome == "missing"
+
+
+def test_run_out_is_in_the_spread_of_a_critical_speed():
+    moved, near = _beside(mode(1010.0, 4.0, 0.01), [Peak(speed=1000.0, size=1.0, lower=900.0, upper=1140.0)])
+    assert moved.speed.sd == pytest.approx(10.0, rel=1e-3)
+    assert moved.amplification.sd == pytest.approx(abs(near.amplification - 4.0), rel=0.01)
+    assert _beside(mode(1010.0, 4.0, 0.01), [])[0].speed.sd == 0.1
+
+
+def test_a_machine_is_judged_by_its_own_clearances_and_speeds(spindle):
+    machine = Machine(spindle.estimate, replace(spindle.rig, limits=None), ())
+    assert machine.clearance() == 0.2e-3
+    assert machine.clearance(axial=True) is None
+    assert [machine.operates_at(n * RPM) for n in (3_000.0, 24_900.0, 30_000.0)] == [False, True, True]
 
 
 @pytest.fixture(scope="module")

@@ -141,11 +141,14 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
         loop = loops[fastest.name][1]
     items = items_of(machine, {name: m for name, (m, _) in loops.items()}, loop)
     warnings += [] if machine.resonances is None else machine.resonances.warnings
-    if machine.operation.touch_down is None and machine.rig.clearance is not None:
-        warnings.append(
-            "the radial clearance is that of loop.limits.position: give operation.touch_down in the rig, as the "
-            "touch-down bearings have it"
-        )
+    own = {"touch_down": machine.operation.touch_down}
+    if any(b.axial for b in e.plant.bearings):
+        own["axial_touch_down"] = machine.operation.axial_touch_down
+    warnings += [
+        f"the {'clearance along the shaft' if 'axial' in key else 'radial clearance'} is that of "
+        f"loop.limits.position: give operation.{key} in the rig, as the touch-down bearings have it"
+        for key, value in own.items() if value is None and machine.rig.position_limit is not None
+    ]  # fmt: skip
     return Acceptance(
         status=e.status, model=e.model, record=origin(machine.benches[0].record),
         records=tuple({**origin(b.record), "file": b.name, "kind": b.kind, "speed": b.speed} for b in machine.benches),

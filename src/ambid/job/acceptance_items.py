@@ -23,6 +23,7 @@ from ambid.control.closed import ClosedLoop
 from ambid.control.limits import CLEARANCE_SHARE, residual_unbalance, vibration_limit
 from ambid.control.margins import Margins, synchronous
 from ambid.control.zones import DISPLACEMENT, ZONES, Grade
+from ambid.estimation.modes import EstimatedNumber
 from ambid.estimation.result import NORMAL_95
 from ambid.job.closed_loop import spectra_of
 from ambid.job.rotor import RotorRecord, balance_planes
@@ -35,7 +36,17 @@ from ambid.rotor.balance import Machine as Rotor
 from ambid.rotor.balance import Turned
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of, whirl_of
-from ambid.rotor.resonance import CRITICALLY_DAMPED, Peak, Resonances, peaks, resonances, scaled_to_limit, separations
+from ambid.rotor.resonance import (
+    CRITICALLY_DAMPED,
+    SCALING,
+    Peak,
+    Resonance,
+    Resonances,
+    peaks,
+    resonances,
+    scaled_to_limit,
+    separations,
+)
 from ambid.rotor.synchronous import Separated, separate
 
 _RPM = 30.0 / math.pi
@@ -43,6 +54,7 @@ _SECTORS, _ROUND = 8, 0.5  # directions; the least reach over the largest, of a 
 _STOP, _STAYS = 0.95, 0.3  # quantile of a direction that is its stop; share of the samples near the stops
 _STEPS, _LIKE = 400, 0.05  # speeds of a response; relative difference of critical speeds that are one
 _NEAR = 0.03  # of the maximum speed, within which a record is one at it
+_LAST = 0.005  # of it, by which the mean of the last block of a run-up may be below it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -170,6 +182,11 @@ class Machine:
             return self.operation.axial_touch_down  # of which the radial one says nothing
         return self.rig.clearance
 
+    def operates_at(self, speed: float) -> bool:
+        """Whether a speed in rad/s is one of continuous operation."""
+        low, top = self.speeds
+        return (1.0 - _NEAR) * low <= abs(speed) <= (1.0 + _NEAR) * top
+
     def largest(self, b: Bench, bearing: Bearing) -> float:
         """Return the largest displacement in a bearing in any sample, m."""
         return displacements(b.record, self.estimate.plant)[bearing.name]
@@ -212,7 +229,7 @@ def _axial(plant: RotorModel, role: str) -> bool:
 def items_of(machine: Machine, margins: Mapping[str, Margins], loop: ClosedLoop | None) -> list[Item]:
     """Return all items; `margins`: of the loop of each steady record, `loop`: that of the fastest."""
     return [
-        *_sensitivity(margins), *_vibration(machine), *_bearings(machine, loop), *_critical(machine, loop),
+        *_sensitivity(machine, margins), *_vibration(machine), *_bearings(machine, loop), *_critical(machine, loop),
         *_unbalance(machine), *_collocation(machine), *_capacity(machine), *_touch_down(machine),
     ]  # fmt: skip
 
@@ -232,20 +249,23 @@ def _missing(part: Part, what: str, record: str) -> Item:
     return Item(part=part, what=what, outcome="missing", words=f"{record} would")
 
 
-def _sensitivity(margins: Mapping[str, Margins]) -> Iterator[Item]:
+def _sensitivity(machine: Machine, margins: Mapping[str, Margins]) -> Iterator[Item]:
+    """Judge the sensitivity as measured; one that no excitation shows, but the loop as identified, is reported."""
     for name, m in margins.items():
         for axis, s in m.sensitivity.items():
             zone = s.rating
             hz = s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
             yield _item(
                 "sensitivity", f"axis {axis}, {name}", zone.peak_db, zone.sd_db, "dB",
-                f"zone {zone.words}, {zone.source}, at {hz:.4g} Hz", outcome=outcome_of_zone(zone),
+                f"zone {zone.words}, {zone.source}, at {hz:.4g} Hz",
+                outcome="reported" if s.measured is None else outcome_of_zone(zone),
                 limit=20.0 * math.log10(ZONES[1][0]), limits="sensitivity",
             )  # fmt: skip
-    if not margins:
+    shown = [m for m in margins.values() if all(s.measured is not None for s in m.sensitivity.values())]
+    if not shown:
         record = "a record at rest or at a speed with an excitation logged as reference of each axis"
         yield _missing("sensitivity", "all axes", record)
-    elif not any(m.speed for m in margins.values()):
+    elif not any(m.speed and machine.operates_at(m.speed) for m in shown):
         yield _missing("sensitivity", "at speed", "a record at the maximum speed with excitation")
 
 
@@ -267,7 +287,7 @@ def _vibration(machine: Machine) -> Iterator[Item]:
                 outcome="reported" if b.kind == "run-up" else outcome_of_zone(grade),
                 limit=DISPLACEMENT[1][0] * clearance, limits="displacement",
             )  # fmt: skip
-    if not any(b.kind == "speed" for b in turning):
+    if not any(b.kind == "speed" and machine.operates_at(b.speed) for b in turning):
         yield _missing("vibration", "steady operation", "a record at the maximum speed")
 
 
@@ -313,25 +333,29 @@ def _critical(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
         yield _missing("critical", "critical speeds", record)
         return
     top, alone = machine.speeds[1], _of_unbalance(machine, loop)
-    for k, x in enumerate(separations(machine.resonances.resonances, machine.speeds), 1):
-        r, factor = x.resonance, x.resonance.amplification
+    beside = [_beside(r, alone) for r in machine.resonances.resonances]
+    margins = separations([r for r, _ in beside], machine.speeds)
+    for k, (x, (r, near)) in enumerate(zip(margins, beside, strict=True), 1):
+        factor, needed = r.amplification, x.required_most > 0.0
         way = "" if r.forward is None else f", {100.0 * r.forward:.0f} % of the motion forward"
         words = f"damping ratio {100.0 * r.damping.value:.3g} %, largest in bearing {r.plane}{way}"
-        near = min(alone, key=lambda p: abs(p.speed - r.speed.value), default=None)
-        if near is None or r.critically_damped or abs(near.speed / r.speed.value - 1.0) > _LIKE:
-            near = None
         if near is not None:
             words += f"; {near.speed * _RPM:.5g} 1/min by the machine as identified, without run-out"
-        yield _item("critical", f"critical speed {k}", r.speed.value, r.speed.sd, "rad/s", words)
         how = "by half-power points" if r.half_power else "1/(2 damping ratio)"
-        words = f"{how}: critically damped, no separation is needed" if r.critically_damped else how
+        if r.speed.identifiable:
+            yield _item("critical", f"critical speed {k}", r.speed.value, r.speed.sd, "rad/s", words)
+        else:
+            how += (
+                f", about {round(r.speed.value * _RPM, -2):.0f} 1/min: too well damped for its numbers to be measured"
+            )
+        words = how if needed else f"{how}; critically damped, no separation is needed"
         if near is not None and near.amplification is not None:
             words += f"; {near.amplification:.3g} by the machine as identified"
         yield _item(
             "critical", f"amplification factor {k}", factor.value, factor.sd, "1", words,
             limit=CRITICALLY_DAMPED, limits="amplification",
         )  # fmt: skip
-        if not r.critically_damped:
+        if needed:
             place = "within" if x.actual == 0.0 else "above" if r.speed.value > top else "below"
             fails = x.actual + NORMAL_95 * x.sd < x.required
             yield _item(
@@ -340,10 +364,26 @@ def _critical(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
                 limit=100.0 * x.required_most, limits="separation",
             )  # fmt: skip
     fastest = max(float(p.speed.max()) for p in machine.passages.values())
-    if not machine.resonances.resonances:
-        yield _item("critical", "speed without a critical one", fastest, 0.0, "rad/s", "highest of the run-ups")
-    if fastest < top:
+    words = "a critical speed above it is not seen"
+    yield _item("critical", "highest speed of the run-ups", fastest, 0.0, "rad/s", words)
+    if fastest < (1.0 - _LAST) * top:
         yield _missing("critical", "critical speeds up to the maximum", f"a run-up to {top * _RPM:.5g} 1/min")
+
+
+def _beside(r: Resonance, alone: Sequence[Peak]) -> tuple[Resonance, Peak | None]:
+    """Return a resonance with what the run-out of the sensors may do to it in its spread, and the peak beside it of the
+    machine as identified, which has none.
+    """
+    near = min(alone, key=lambda p: abs(p.speed - r.speed.value), default=None)
+    if near is None or r.critically_damped or abs(near.speed / r.speed.value - 1.0) > _LIKE:
+        return r, None
+    factor = r.amplification.value if near.amplification is None else near.amplification
+    return replace(r, speed=_wider(r.speed, near.speed), amplification=_wider(r.amplification, factor)), near
+
+
+def _wider(x: EstimatedNumber, other: float) -> EstimatedNumber:
+    sd = math.hypot(x.sd, other - x.value)
+    return EstimatedNumber.of(x.value, sd, visible=x.identifiable)
 
 
 def _of_unbalance(machine: Machine, loop: ClosedLoop | None) -> list[Peak]:
@@ -383,7 +423,7 @@ def _unbalance(machine: Machine) -> Iterator[Item]:
         record = f"a record at the maximum speed, {top * _RPM:.5g} 1/min, or a run-up to it,"
         yield _missing("unbalance", "vibration at the maximum speed", record)
     for role, (value, sd, name) in at.items():
-        spread, limit = math.hypot(sd, machine.gain_sd(role) * value), vibration_limit(top)
+        spread, limit = math.hypot(sd, machine.gain_sd(role) * value), vibration_limit(top, running=True)
         yield _item(
             "unbalance", f"synchronous vibration, {role.replace('_', ' ')}", value, spread, "m",
             f"peak to peak, {name}", outcome=outcome_of(value, spread, limit), limit=limit, limits="vibration",
@@ -401,12 +441,16 @@ def _scaled(machine: Machine) -> Iterator[Item]:
         return
     limit, room = 0.5 * vibration_limit(top), CLEARANCE_SHARE * clearance
     for name, p in runs.items():
-        for plane, _, _ in p.planes:
-            x = scaled_to_limit(p.speed, p.whirl(plane).major, (low, top), limit, room)
+        for plane, one, _ in p.planes:
+            whirl = p.whirl(plane)
+            x = scaled_to_limit(p.speed, whirl.major, (low, top), limit, room)
+            relative = (2.0**0.5 * whirl.sd / whirl.major)[np.isin(p.speed, (x.at, x.largest_at))]
+            gain = machine.gain_sd(p.roles[one]) if x.factor in SCALING else 0.0  # else it drops out
+            size, sd = 2.0 * x.largest, 2.0 * x.largest * math.hypot(gain, *relative)
             yield _item(
-                "unbalance", f"response scaled to the limit, bearing {plane}, {name}", 2.0 * x.largest, 0.0, "m",
+                "unbalance", f"response scaled to the limit, bearing {plane}, {name}", size, sd, "m",
                 f"peak to peak at {x.largest_at * _RPM:.5g} 1/min, {x.factor:.3g} times as measured",
-                outcome="passed" if x.passed else "failed", limit=2.0 * room, limits="scaled",
+                outcome=outcome_of(size, sd, 2.0 * room), limit=2.0 * room, limits="scaled",
             )  # fmt: skip
 
 
@@ -464,10 +508,11 @@ def _touch_down(machine: Machine) -> Iterator[Item]:
         clearance = machine.clearance(axial=bearing.axial)
         if clearance is not None:
             top = max((machine.largest(b, bearing) for b in machine.benches if b not in stops), default=0.0)
+            sd = max(machine.gain_sd(f"{axis}_position") for axis in bearing.axes) * top
             yield _item(
-                "touch_down", f"largest displacement, bearing {bearing.name}", top, 0.0, "m",
+                "touch_down", f"largest displacement, bearing {bearing.name}", top, sd, "m",
                 f"{100.0 * top / clearance:.3g} % of the clearance, with the excitation",
-                outcome="passed" if top < clearance else "failed", limit=clearance,
+                outcome=outcome_of(top, sd, clearance), limit=clearance,
             )  # fmt: skip
         for b in stops:
             reach = _reach(b.record, bearing.axes)

@@ -236,7 +236,7 @@ def _whirl(axes: Axes, a: Acceptance) -> None:
         y = np.concatenate(frequencies) / (2.0 * np.pi)
         axes.plot(x, y, ".", color=color, label=label, linestyle="none", markersize=4)
     axes.plot(speed, speed / 60.0, color=MEASURED, linewidth=0.9, label="speed itself (1x)")
-    at = [x for x in a.of("critical") if x.unit == "rad/s" and x.value is not None]
+    at = [x for x in a.of("critical") if x.what.startswith("critical speed") and x.value is not None]
     if at:
         w = np.array([float(x.value or 0.0) for x in at])
         axes.plot(

@@ -293,11 +293,13 @@ class Rig:
 
     @property
     def clearance(self) -> float | None:
-        """Radial clearance in the touch-down bearings, m: that of ``[operation]``, else the smaller end of
-        ``loop.limits.position``; None where neither is given.
-        """
-        if self.operation is not None and self.operation.touch_down is not None:
-            return self.operation.touch_down
+        """Radial clearance in the touch-down bearings, m: that of ``[operation]``, else `position_limit`."""
+        own = None if self.operation is None else self.operation.touch_down
+        return self.position_limit if own is None else own
+
+    @property
+    def position_limit(self) -> float | None:
+        """The smaller end of ``loop.limits.position``, m; None where it is not given."""
         least = math.inf if self.limits is None else min(abs(x) for x in self.limits.position)
         return least if math.isfinite(least) else None
 

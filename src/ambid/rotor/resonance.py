@@ -27,7 +27,8 @@ _RESOLVED = 5.0  # blocks in which a mode has to stand out
 _GRID = 600  # speeds
 _DRAWS = 100  # of the response, for intervals
 _NEAR, _WIDTHS = 0.03, 1.5  # of the frequency, and damping ratios, within which a peak belongs to a pole
-_FACTORS = 1.0, 6.0  # by which a response is scaled, at least and at most
+SCALING = (1.0, 6.0)
+"""Least and largest factor by which a response to unbalance is scaled to a limit."""
 _MISFIT = 2.0  # mean square of residuals over their variance from which the fit is doubtful
 
 
@@ -303,6 +304,6 @@ def scaled_to_limit(speed: Array, size: Array, operating: tuple[float, float], l
             f"the passage has no speed between {operating[0] * rpm:.5g} and {operating[1] * rpm:.5g} rpm; the response "
             "is scaled there. Run up to the operating speed"
         )
-    top, factor = int(np.argmax(size)), float(np.clip(limit / size[inside].max(), *_FACTORS))
+    top, factor = int(np.argmax(size)), float(np.clip(limit / size[inside].max(), *SCALING))
     largest = factor * float(size[top])
     return Scaled(factor=factor, largest=largest, largest_at=float(speed[top]), passed=largest <= room)
