@@ -127,7 +127,7 @@ def _measured(x: Item) -> str:
 
 def _sized(value: float, unit: str) -> str:
     scale, own = _OWN.get(unit, (0.0, ""))
-    return f"{scale * value:.4g} {own}" if scale else sized(value, unit, 4)
+    return f"{scale * value:{'.0f' if abs(scale * value) >= 1e4 else '.4g'}} {own}" if scale else sized(value, unit, 4)
 
 
 def _conditions(a: Acceptance) -> Section:

@@ -37,7 +37,7 @@ _SHAPES = "Where a sensor and its magnet stand on different sides of a node, the
 _ORBITS = "Above what turns with the rotor, below the rest, the excitation among it, beside the clearance."
 _BODE_SAYS = (
     "What turns with the rotor, from blocks of whole turns, run-out of the sensors included, which moves critical "
-    "speeds beyond their intervals: these hold noise alone."
+    "speeds; their spreads hold that where the machine as identified stands beside, else noise alone."
 )
 _FALLS = "Amplitude spectra over the speed; each line stands at the height of its speed."
 _WHIRL = (

@@ -22,10 +22,7 @@ SETTINGS = (
     ),
     Setting("amplitude", "positive", "V", "Peak of the excitation in V.", shown="found by trials, smallest first"),
     Setting(
-        "anyway",
-        "switch",
-        "",
-        "Export an unusable estimate too, or one whose record does not show all; the file says so.",
+        "anyway", "switch", "", "Export an unusable estimate too, or one whose record does not show all; it says so."
     ),
     Setting(
         "arm",
@@ -84,11 +81,7 @@ SETTINGS = (
         many=True,
     ),
     Setting(
-        "criterion",
-        "text",
-        "",
-        "Criterion that chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.",
-        default="bic",
+        "criterion", "text", "", "Criterion for orders: bic, aic, aicc, mdl, fpe, holdout or kfold.", default="bic"
     ),
     Setting(
         "delay", "text", "S|auto", "Delay of the inputs in s, for the models.", shown="0; with @rig as the rig says"
