@@ -230,3 +230,10 @@ def test_run_ups_alone_say_which_records_are_missing(run_up):
 def test_a_clearance_that_the_rig_does_not_give_is_that_of_its_limits(run_up):
     assert run_up.accepted.clearance == 0.2e-3
     assert any("loop.limits.position" in w for w in run_up.accepted.warnings)
+
+
+def test_the_spread_of_a_static_load_is_that_of_its_mean(spindle):
+    """The bench carries nothing: what a short record shows is noise, and within it."""
+    for x in spindle.accepted.of("capacity"):
+        assert x.outcome == "passed"
+        assert x.value < 5.0 * x.sd

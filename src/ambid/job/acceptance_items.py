@@ -52,6 +52,7 @@ from ambid.rotor.synchronous import Separated, separate
 _RPM = 30.0 / math.pi
 _SECTORS, _ROUND = 8, 0.5  # directions; the least reach over the largest, of a rotor that is moved along its stops
 _STOP, _STAYS = 0.95, 0.3  # quantile of a direction that is its stop; share of the samples near the stops
+_SPLIT = 8  # parts of a record without excitation, whose scatter is that of its mean
 _STEPS, _LIKE = 400, 0.05  # speeds of a response; relative difference of critical speeds that are one
 _NEAR = 0.03  # of the maximum speed, within which a record is one at it
 _LAST = 0.005  # of it, by which the mean of the last block of a run-up may be below it
@@ -478,6 +479,14 @@ def _spread(covariance: Array, slope: Array) -> float:
     return math.sqrt(max(float(slope @ covariance @ slope), 0.0))
 
 
+def _means(b: Bench, role: str) -> Array:
+    """Return the mean of a channel in each period of the excitation, without one in parts of the record."""
+    values, e = b.record[role].values, None if b.apart is None else b.apart.excitation
+    if e is not None and e.count > 1:
+        return np.asarray(values[e.first : e.first + e.period * e.count].reshape(e.count, -1).mean(axis=1))
+    return np.array([x.mean() for x in np.array_split(values, _SPLIT)])
+
+
 def _capacity(machine: Machine) -> Iterator[Item]:
     """Say how much of its force each magnet needs for what it carries, by its current and position in the mean."""
     e, limits = machine.estimate, machine.rig.limits
@@ -487,9 +496,11 @@ def _capacity(machine: Machine) -> Iterator[Item]:
         names = (f"{axis}.k_i", f"{axis}.k_x")
         k_i, k_x = (e.numbers[n] for n in names)
         for b in (b for b in machine.steady if role in b.record):
-            i, x = (float(b.record[f"{axis}_{q}"].values.mean()) for q in ("current", "position"))
-            spread = math.hypot(_spread(e.covariance_of(names), np.array([i, -x])), machine.gain_sd(role) * k_i * i)
-            loads.append((abs(k_i * i - k_x * x), spread))
+            means = np.array([_means(b, f"{axis}_{q}") for q in ("current", "position")])
+            i, x = means.mean(axis=1)
+            scatter = float(np.std([k_i, -k_x] @ means, ddof=1)) / math.sqrt(means.shape[1])
+            of_numbers = _spread(e.covariance_of(names), np.array([i, -x]))
+            loads.append((abs(k_i * i - k_x * x), math.hypot(of_numbers, machine.gain_sd(role) * k_i * i, scatter)))
         if not math.isfinite(most) or not loads:
             what = "a rig with loop.limits.current" if loads else f"a record with the current of axis {axis}"
             yield _missing("capacity", f"axis {axis}", what)
@@ -511,7 +522,7 @@ def _touch_down(machine: Machine) -> Iterator[Item]:
             sd = max(machine.gain_sd(f"{axis}_position") for axis in bearing.axes) * top
             yield _item(
                 "touch_down", f"largest displacement, bearing {bearing.name}", top, sd, "m",
-                f"{100.0 * top / clearance:.3g} % of the clearance, with the excitation",
+                f"{100.0 * top / clearance:.3g} % of the clearance, in any sample of any record",
                 outcome=outcome_of(top, sd, clearance), limit=clearance,
             )  # fmt: skip
         for b in stops:

@@ -82,8 +82,8 @@ def _of_motion(motion: Complex, rate_hz: float, speed: float, plane: str, *, two
     bins = 2.0 * np.pi * rate_hz / n
     for direction in (1, -1) if two else (0,):
         way = -1 if direction * np.sign(speed or 1.0) < 0 else 1
-        side = smooth[: size // 2] if way > 0 else smooth[:0:-1][: size // 2]
-        mine = power[: n // 2] if way > 0 else np.concatenate([power[:1], power[:0:-1]])[: n // 2]
+        side, mine = (x if way > 0 else np.concatenate([x[:1], x[:0:-1]]) for x in (smooth, power))
+        side, mine = side[: size // 2], mine[: n // 2]
         for k, width in _tops(side, size):
             fit = _lorentzian(mine, k * n / size, width * n / size)
             if fit is None:
