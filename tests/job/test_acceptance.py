@@ -12,12 +12,14 @@ import ambid
 from ambid.control.acceptance import PARTS, dynamic_stiffness
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
+from ambid.control.limits import vibration_limit
 from ambid.errors import EstimationError
 from ambid.estimation.modes import EstimatedNumber
-from ambid.job.acceptance_items import Machine, _beside, _critical
+from ambid.job.acceptance_items import Machine, _beside, _critical, _scaled
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
 from ambid.rig.rotor import Operation
+from ambid.rotor.passage import whirl_of
 from ambid.rotor.resonance import Peak, Resonance, Resonances
 from ambid.simulation.rotor_bench import RotorBench
 from ambid.simulation.variation import Schedule
@@ -171,6 +173,24 @@ def test_run_out_is_in_the_spread_of_a_critical_speed():
     assert moved.speed.sd == pytest.approx(10.0, rel=1e-3)
     assert moved.amplification.sd == pytest.approx(abs(near.amplification - 4.0), rel=0.01)
     assert _beside(mode(1010.0, 4.0, 0.01), [])[0].speed.sd == 0.1
+
+
+def test_the_scaled_response_is_that_of_a_held_speed_where_a_run_up_passed_too_fast():
+    speed, roles = np.linspace(500.0, 2500.0, 201), ("ax_position", "ay_position")
+    passed = np.outer(2e-6 + 8e-6 * np.exp(-(((speed - 1000.0) / 100.0) ** 2)), [1.0, -1j])
+    run = SimpleNamespace(
+        speed=speed, roles=roles, amplitude=passed, planes=(("A", 0, 1),),
+        whirl=lambda _: whirl_of(passed, np.full(passed.shape, 1e-8)),
+    )  # fmt: skip
+    held = SimpleNamespace(roles=roles, speed=np.array([990.0]), response=np.array([[20e-6, -20e-6j]]))
+    machine = SimpleNamespace(
+        clearance=lambda: 70e-6, speeds=(1900.0, 2100.0), passages={"run": run}, resonances=held, gain_sd=lambda _: 0.0
+    )  # fmt: skip
+    item = next(_scaled(machine))
+    assert item.value == pytest.approx(10.0 * vibration_limit(2100.0), rel=1e-6)
+    assert item.outcome == "failed"
+    machine.resonances = None
+    assert next(_scaled(machine)).outcome == "passed"
 
 
 def test_a_machine_is_judged_by_its_own_clearances_and_speeds(spindle):

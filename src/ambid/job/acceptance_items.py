@@ -342,6 +342,8 @@ def _critical(machine: Machine, loop: ClosedLoop | None) -> Iterator[Item]:
         words = f"damping ratio {100.0 * r.damping.value:.3g} %, largest in bearing {r.plane}{way}"
         if near is not None:
             words += f"; {near.speed * _RPM:.5g} 1/min by the machine as identified, without run-out"
+        else:
+            words += "; what run-out of the sensors does to it is not in its spread"
         how = "by half-power points" if r.half_power else "1/(2 damping ratio)"
         if r.speed.identifiable:
             yield _item("critical", f"critical speed {k}", r.speed.value, r.speed.sd, "rad/s", words)
@@ -442,10 +444,15 @@ def _scaled(machine: Machine) -> Iterator[Item]:
         return
     limit, room = 0.5 * vibration_limit(top), CLEARANCE_SHARE * clearance
     for name, p in runs.items():
-        for plane, one, _ in p.planes:
-            whirl = p.whirl(plane)
-            x = scaled_to_limit(p.speed, whirl.major, (low, top), limit, room)
-            relative = (2.0**0.5 * whirl.sd / whirl.major)[np.isin(p.speed, (x.at, x.largest_at))]
+        for plane, one, other in p.planes:
+            whirl, speed, steady = p.whirl(plane), p.speed, p.amplitude[:0, [one, other]]
+            if machine.resonances is not None and machine.resonances.roles == p.roles:  # higher than what passes it
+                speed = np.append(speed, machine.resonances.speed)
+                steady = machine.resonances.response[:, [one, other]]
+            held = whirl_of(steady, np.zeros(steady.shape)).major
+            x = scaled_to_limit(speed, np.append(whirl.major, held), (low, top), limit, room)
+            near = [int(np.argmin(np.abs(p.speed - w))) for w in (x.at, x.largest_at)]
+            relative = (math.sqrt(2.0) * whirl.sd / whirl.major)[near]
             gain = machine.gain_sd(p.roles[one]) if x.factor in SCALING else 0.0  # else it drops out
             size, sd = 2.0 * x.largest, 2.0 * x.largest * math.hypot(gain, *relative)
             yield _item(

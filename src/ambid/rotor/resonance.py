@@ -111,9 +111,12 @@ class Resonance:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Resonances:
-    """What passages show."""
+    """What passages show: resonances, and the synchronous response at constant speed that belongs to them."""
 
     resonances: tuple[Resonance, ...]  # by speed
+    speed: Array  # (n,), rad/s, a grid over the range
+    response: Complex  # (n, n_roles), to unbalance and what run-out does, of the longest way, m
+    roles: tuple[str, ...]
     misfit: float  # mean square of the residuals over their variance
     warnings: tuple[str, ...] = ()
 
@@ -151,7 +154,9 @@ def resonances(passages: Sequence[Passage]) -> Resonances:
             elif one.damping.value < _SMOOTH:
                 unsure.append(one)
     warnings = tuple(_warnings(fit.poles.size, misfit, passages, unsure))
-    return Resonances(resonances=tuple(modal), misfit=misfit, warnings=warnings)
+    return Resonances(
+        resonances=tuple(modal), speed=speed, response=response, roles=passage.roles, misfit=misfit, warnings=warnings
+    )
 
 
 def _grid(poles: Complex, low: float, high: float) -> Array:
@@ -288,6 +293,7 @@ class Scaled:
     """A measured response to unbalance, multiplied so that it reaches a limit in the operating range."""
 
     factor: float
+    at: float  # speed in the operating range at which it reaches the limit, rad/s
     largest: float  # zero to peak over all speeds, scaled, m
     largest_at: float  # rad/s
     passed: bool
@@ -304,6 +310,7 @@ def scaled_to_limit(speed: Array, size: Array, operating: tuple[float, float], l
             f"the passage has no speed between {operating[0] * rpm:.5g} and {operating[1] * rpm:.5g} rpm; the response "
             "is scaled there. Run up to the operating speed"
         )
-    top, factor = int(np.argmax(size)), float(np.clip(limit / size[inside].max(), *SCALING))
-    largest = factor * float(size[top])
-    return Scaled(factor=factor, largest=largest, largest_at=float(speed[top]), passed=largest <= room)
+    k, top = int(np.argmax(np.where(inside, size, -np.inf))), int(np.argmax(size))
+    factor = float(np.clip(limit / size[k], *SCALING))
+    largest, at, largest_at = factor * float(size[top]), float(speed[k]), float(speed[top])
+    return Scaled(factor=factor, at=at, largest=largest, largest_at=largest_at, passed=largest <= room)
