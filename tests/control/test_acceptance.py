@@ -80,4 +80,5 @@ def test_a_limit_says_whether_it_is_confirmed(name, confirmed):
     [(1.0, 0.0, "passed"), (1.9, 0.01, "passed"), (1.99, 0.1, "doubt"), (2.5, 0.1, "failed")],
 )
 def test_an_outcome_heeds_the_interval(value, sd, outcome):
+    assert outcome_of(1.0, np.nan, 2.0) == "doubt"
     assert outcome_of(value, sd, 2.0) == outcome

@@ -161,7 +161,9 @@ class Acceptance(Judged):
 
 
 def outcome_of(value: float, sd: float, limit: float) -> Outcome:
-    """Judge a number that is to lie below its limit."""
+    """Judge a number that is to lie below its limit; one of which it is not known how well it is known is in doubt."""
+    if not np.isfinite(sd):
+        return "doubt"
     if value + NORMAL_95 * sd < limit:
         return "passed"
     return "doubt" if value - NORMAL_95 * sd < limit else "failed"
