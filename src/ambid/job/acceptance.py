@@ -168,13 +168,14 @@ def _checks(machine: Machine, items: Sequence[Item]) -> dict[str, Check]:
     for part, title in PARTS.items():
         own = [x for x in items if x.part == part and x.outcome in ("passed", "doubt", "failed")]
         against = [x for x in own if x.outcome != "passed"]
-        worst = next((x for x in against if x.outcome == "failed"), against[0] if against else None)
+        worst = max(against, key=lambda x: (x.outcome == "failed", x.confirmed), default=None)
         if worst is not None:
             said = f"{worst.what}{f', {worst.words}' if worst.words else ''}"
             passes = "does not keep its limit" if worst.outcome == "failed" else "may not keep its limit"
             more = f", and {counted(len(against) - 1, 'other item')}" if len(against) > 1 else ""
             source = "" if worst.confirmed else "; the limit is unconfirmed"
-            checks[part] = Check(passed=False, detail=f"{said} {passes}{more}{source}. See '{title}'")
+            detail = f"{said} {passes}{more}{source}. See '{title}'"
+            checks[part] = Check(passed=False, detail=detail, grave=worst.outcome == "failed" and worst.confirmed)
         elif own:
             checks[part] = Check(passed=True, detail=f"{counted(len(own), 'item')} within the limits")
     missing = [x for x in items if x.outcome == "missing"]
@@ -187,7 +188,8 @@ def _checks(machine: Machine, items: Sequence[Item]) -> dict[str, Check]:
     e = machine.estimate
     reasons = "; ".join(f"{r.check}: {r.text}" for r in e.verdict.reasons)
     checks["estimate"] = Check(
-        passed=e.passed, detail=f"of the machine: {reasons}" if reasons else "the estimate of the machine is usable"
+        passed=e.passed, detail=f"of the machine: {reasons}" if reasons else "the estimate of the machine is usable",
+        grave=e.verdict.word == "unusable",
     )
     return checks
 
