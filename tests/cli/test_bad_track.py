@@ -108,7 +108,9 @@ def test_an_edited_start_and_a_record_without_a_sound_row_are_refused(ambid, ben
     refused(ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e0.json"), "operating_point")
     known["parameters"]["m"]["value"] = 1e6
     (bench / "e1.json").write_text(json.dumps(known), encoding="utf-8")
-    refused(ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e1.json"), "does not follow from the parameters")
+    refused(
+        ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e1.json"), "does not follow from the parameters"
+    )
     values = columns(record_text)
     values[:, 1:] = np.nan
     (bench / "nan.csv").write_text(with_columns(values), encoding="utf-8")

@@ -135,7 +135,7 @@ def mode(speed, factor, sd):
     number = EstimatedNumber.of
     return Resonance(
         speed=number(speed, 0.1), amplification=number(factor, sd), half_power=True, critically_damped=factor < 2.5,
-        frequency=number(speed, 0.1), damping=number(0.5 / factor, 0.01), pole=-1.0 + 1j * speed, shape={}, forward=1.0,
+        frequency=number(speed, 0.1), damping=number(0.5 / factor, 0.01), forward=1.0,
         measured=None, plane="A",
     )  # fmt: skip
 
@@ -198,6 +198,26 @@ def test_a_machine_is_judged_by_its_own_clearances_and_speeds(spindle):
     assert machine.clearance() == 0.2e-3
     assert machine.clearance(axial=True) is None
     assert [machine.operates_at(n * RPM) for n in (3_000.0, 24_900.0, 30_000.0)] == [False, True, True]
+
+
+def test_a_dead_sensor_is_refused(spindle):
+    dead = tuple(
+        replace(c, values=np.zeros(c.values.size)) if c.name == "bx_position" else c for c in spindle.record.channels
+    )
+    with pytest.raises(EstimationError, match="bx_position is the same in every sample"):
+        ambid.accept(replace(spindle.record, channels=dead), spindle.rig, estimate=spindle.estimate)
+    with pytest.raises(EstimationError, match="has 1 samples; a rotor needs"):
+        ambid.accept(spindle.record, spindle.rig, estimate=spindle.estimate, from_s=0.49991)
+
+
+def test_a_record_of_another_machine_and_another_speed_is_told(spindle):
+    heavier = tuple(replace(p, value=1.4 * p.value) if p.name in ("m", "Id") else p for p in spindle.rig.parameters)
+    how = {"duration": 0.5, "periods": 2, "excitation": "zippered", "band": (8.0, 500.0)}
+    record = ambid.simulate(replace(spindle.rig, parameters=heavier), seed=3, force=True, **how)
+    accepted = ambid.accept(record, spindle.rig, estimate=spindle.estimate, speed_rpm=5000.0)
+    assert "agreement" not in spindle.accepted.checks
+    assert "the plant is not that of this record" in accepted.checks["agreement"].detail
+    assert "not 5000 rpm as given" in accepted.warnings[0]
 
 
 @pytest.fixture(scope="module")

@@ -234,6 +234,8 @@ def test_run_ups_that_cannot_be_simulated_are_refused() -> None:
     for speeds in ("0", "0:x", (0.0, -5.0), (0.0, 0.0)):
         with pytest.raises(AmbidError, match=r"two speeds in rpm or more"):
             simulate("utrc", run_up=speeds)
+    with pytest.raises(AmbidError, match="at 20000 Hz it must be at most 600000"):
+        simulate("utrc", run_up="0:1e9")
     with pytest.raises(AmbidError, match="run_up takes no band"):
         simulate("utrc", run_up="0:1000", band=(1.0, 2.0))
     with pytest.raises(AmbidError, match="for a rotor on many axes"):

@@ -105,7 +105,8 @@ def accept(
             f"a machine is accepted on many axes; the rig's model is {bench.model!r}, of one axis. Give the rig of a "
             f"rotor, with [bearings.X], or use 'ambid margins'"
         )
-    benches = benches_of(read_records(sources_of(records), bench, speed_rpm, say, **reading), bench.rotor)
+    readings = read_records(sources_of(records), bench, speed_rpm, say, **reading)
+    benches = benches_of(readings, bench.rotor)
     clock.lap("read")
     if of_machine is None:
         steady = [b for b in benches if b.kind in ("rest", "speed")]
@@ -120,14 +121,16 @@ def accept(
     clock.lap("identify")
     say("items")
     with one_thread():
-        result = _acceptance(Machine(of_machine, bench, benches), clock)
+        said = [text for r in readings for text in r.warnings]
+        for r, b in zip(readings, benches, strict=True):
+            said += b.apart.warnings(b.name, r.speed or 0.0) if b.apart is not None else []
+        result = _acceptance(Machine(of_machine, bench, benches), said, clock)
     clock.lap("items")
     return replace(result, timing_s=clock.laps, used=tuple(b.record for b in benches))
 
 
-def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
+def _acceptance(machine: Machine, warnings: list[str], clock: Clock) -> Acceptance:
     e, loops = machine.estimate, dict[str, tuple[Margins, ClosedLoop]]()
-    warnings = list[str]()
     excited = [b for b in machine.steady if b.apart is not None and b.apart.excitation is not None]
     for b in excited or machine.steady:
         try:
@@ -139,7 +142,8 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
     if loops:
         fastest = max((b for b in machine.steady if b.name in loops), key=lambda b: abs(b.speed))
         loop = loops[fastest.name][1]
-    items = items_of(machine, {name: m for name, (m, _) in loops.items()}, loop)
+    margins = {name: m for name, (m, _) in loops.items()}
+    items = items_of(machine, margins, loop)
     warnings += [] if machine.resonances is None else machine.resonances.warnings
     own = {"touch_down": machine.operation.touch_down}
     if any(b.axial for b in e.plant.bearings):
@@ -152,7 +156,7 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
     return Acceptance(
         status=e.status, model=e.model, record=origin(machine.benches[0].record),
         records=tuple({**origin(b.record), "file": b.name, "kind": b.kind, "speed": b.speed} for b in machine.benches),
-        items=tuple(items), checks=_checks(machine, items), margins={name: m for name, (m, _) in loops.items()},
+        items=tuple(items), checks=_checks(machine, items, margins), margins=margins,
         stiffness=None if loop is None else _curves(machine, loop), estimate=e, clearance=machine.rig.clearance,
         runs=tuple(_run(name, p) for name, p in machine.passages.items()),
         points=tuple(x for b in machine.steady if b.apart is not None for x in whirl_points(b.apart, e.plant)),
@@ -162,8 +166,10 @@ def _acceptance(machine: Machine, clock: Clock) -> Acceptance:
     )  # fmt: skip
 
 
-def _checks(machine: Machine, items: Sequence[Item]) -> dict[str, Check]:
-    """Judge each part by its items, what cannot be seen, and the estimate of the machine."""
+def _checks(machine: Machine, items: Sequence[Item], margins: Mapping[str, Margins]) -> dict[str, Check]:
+    """Judge each part by its items, what cannot be seen, and the estimate of the machine, by itself and by what the
+    records show of their loop.
+    """
     checks = dict[str, Check]()
     for part, title in PARTS.items():
         own = [x for x in items if x.part == part and x.outcome in ("passed", "doubt", "failed")]
@@ -188,9 +194,15 @@ def _checks(machine: Machine, items: Sequence[Item]) -> dict[str, Check]:
     e = machine.estimate
     reasons = "; ".join(f"{r.check}: {r.text}" for r in e.verdict.reasons)
     checks["estimate"] = Check(
-        passed=e.passed, detail=f"of the machine: {reasons}" if reasons else "the estimate of the machine is usable",
+        passed=e.passed,
+        detail=f"of the machine: {reasons}" if reasons else "the estimate of the machine is usable",
         grave=e.verdict.word == "unusable",
     )
+    unlike = [
+        f"{name}: {c.detail}" for name, m in margins.items() for c in [m.checks.get("agreement")] if c and not c.passed
+    ]
+    if unlike:
+        checks["agreement"] = Check(passed=False, detail="; ".join(unlike))
     return checks
 
 

@@ -23,10 +23,11 @@ from ambid.control.closed import ClosedLoop
 from ambid.control.limits import CLEARANCE_SHARE, residual_unbalance, vibration_limit
 from ambid.control.margins import Margins, synchronous
 from ambid.control.zones import DISPLACEMENT, ZONES, Grade
+from ambid.errors import EstimationError
 from ambid.estimation.modes import EstimatedNumber
 from ambid.estimation.result import NORMAL_95
 from ambid.job.closed_loop import spectra_of
-from ambid.job.rotor import RotorRecord, balance_planes
+from ambid.job.rotor import LEAST, RotorRecord, balance_planes
 from ambid.physics.loop import UNLIMITED
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Record
@@ -35,7 +36,15 @@ from ambid.rig.rotor import Operation
 from ambid.rotor.balance import Machine as Rotor
 from ambid.rotor.balance import Turned
 from ambid.rotor.estimate import RotorEstimate
-from ambid.rotor.passage import Passage, changes_speed, displacements, track_passage, turning_of, whirl_of
+from ambid.rotor.passage import (
+    Passage,
+    changes_speed,
+    displacements,
+    positions_of,
+    track_passage,
+    turning_of,
+    whirl_of,
+)
 from ambid.rotor.resonance import (
     CRITICALLY_DAMPED,
     SCALING,
@@ -82,6 +91,14 @@ def benches_of(readings: Sequence[RotorRecord], model: RotorModel) -> list[Bench
 def _bench(read: RotorRecord, model: RotorModel) -> Bench:
     """Tell a run-up by the range of its speed, and a rotor moved along its stops by how far it comes all around."""
     record = read.bench
+    if record.n_samples < LEAST:
+        raise EstimationError(f"record {read.name} has {record.n_samples} samples; a rotor needs {LEAST}. Take more")
+    dead = next((role for role in positions_of(record, model) if not np.ptp(record[role].values) > 0.0), None)
+    if dead is not None:
+        raise EstimationError(
+            f"record {read.name}: {dead} is the same in every sample, and would pass for a bearing at rest. "
+            "Check its sensor and column, or omit the record"
+        )
     if changes_speed(record):
         top = float(np.max(np.abs(turning_of(record).speed(record.rate_hz))))
         return Bench(record=record, name=read.name, kind="run-up", speed=top, apart=None)

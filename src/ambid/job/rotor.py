@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ambid.rotor.spectra import Excitation, PeriodSpectra
     from ambid.rotor.synchronous import Separated
 
-_LEAST = 200  # samples
+LEAST = 200  # samples
 _TURNING = ("angle", "speed", "tacho")
 _SAME_RATE = 1e-6
 _ROUNDS = 4  # in which lines of hum are taken out
@@ -335,9 +335,9 @@ def name_of(bench: Record) -> str:
 
 def _check(bench: Record, rig: Rig) -> None:
     """Refuse what no number can come from."""
-    if bench.n_samples < _LEAST:
+    if bench.n_samples < LEAST:
         raise EstimationError(
-            f"{name_of(bench)} has {bench.n_samples} samples; a rotor needs {_LEAST}. Give a longer record"
+            f"{name_of(bench)} has {bench.n_samples} samples; a rotor needs {LEAST}. Give a longer record"
         )
     for role in (*rig.plant.inputs, *rig.plant.outputs):
         if not np.ptp(bench[role].values) > 0.0:

@@ -263,6 +263,11 @@ def _run_up(
     bench = _bench(source, rate, closed, nonlinear, None, speed=max(speeds))
     if not isinstance(bench, RotorBench):
         raise AmbidError(f"{setting('run_up')} is for a rotor on many axes. Omit it")
+    if max(rpm) > 30.0 * bench.rate_hz:
+        raise AmbidError(
+            f"{setting('run_up')} goes to {max(rpm):g} rpm; at {bench.rate_hz:g} Hz it must be at most "
+            f"{30.0 * bench.rate_hz:g}, two samples in a turn. Correct it, or {setting('rate_hz')}"
+        )
     for speed in np.linspace(0.0, max(speeds), _LOOKED_AT) if not force else ():
         bench.at_speed(float(speed)).refuse_unstable()
     ways = len(speeds) - 1
