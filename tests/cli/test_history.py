@@ -174,6 +174,8 @@ def test_a_silent_bearing_ends_in_three_until_somebody_takes_note(demo, ambid, m
         (("A", *note[:2]), "needs the name of the BEARING, and --why"),
         (("A", "--until", "2027-01-01"), "--until needs --acknowledge"),
         (("A", *note, "--until", "soon"), "--until is 'soon'"),
+        (("A", *note, "--until", "2020-01-01"), "--until 2020-01-01 is over already"),
+        (("A", "--acknowledge", "", "--why", "x"), "no alarm '' stands"),
         (("A", "--acknowledge", "k_i", "--why", "x"), "no alarm 'k_i' stands; those that stand: stale."),
     ):
         refused = ambid(words[0], *more, *words[1:])

@@ -62,6 +62,27 @@ def test_checked(here, ambid):
     assert "ambid ledger restore" in done.err
 
 
+def test_a_damaged_ledger_is_told_and_not_copied(here, ambid):
+    c = sqlite3.connect("l.db")
+    c.execute("DROP TABLE correction")
+    c.close()
+    done = ambid("ledger", "check", "l.db")
+    assert (done.code, done.out) == (3, "l.db: table 'correction' is damaged: it lacks all of it\n")
+    done = ambid("ledger", "merge", "new.db", "l.db")
+    assert (done.code, "l.db is damaged: table 'correction'" in done.err) == (2, True)
+
+
+def test_a_ledger_is_itself_by_any_name_and_a_folder_is_no_backup(here, ambid):
+    (here / "link.db").hardlink_to("l.db")
+    (here / "folder.db").mkdir()
+    for words in (("merge", "l.db", "link.db"), ("retain", "l.db", "--older-than", "1", "-o", "link.db"),
+                  ("backup", "l.db", "-o", "link.db")):  # fmt: skip
+        done = ambid("ledger", *words)
+        assert (done.code, "link.db is the ledger itself" in done.err) == (2, True)
+    done = ambid("ledger", "backup", "l.db", "-o", "folder.db")
+    assert (done.code, "folder.db exists, and is not a ledger" in done.err) == (2, True)
+
+
 @pytest.mark.parametrize("words", [("check",), ("backup", "-o", "x.db"), ("retain", "--older-than", "1", "-o", "x.db")])
 def test_a_ledger_that_is_not_there_is_not_made(here, ambid, words):
     done = ambid("ledger", words[0], "none.db", *words[1:])

@@ -298,3 +298,5 @@ def test_times_are_read_as_utc_unless_they_say_otherwise():
     assert moment("2026-03-01T14:30") == moment("2026-03-01T15:30+01:00") == moment("2026-03-01 14:30:00Z")
     with pytest.raises(AmbidError, match="must be a date and time"):
         moment("01.03.2026")
+    with pytest.raises(AmbidError, match="from 1900 to 2999"):
+        moment("0001-01-01T00:00+14:00")

@@ -91,6 +91,8 @@ def command(v: Values) -> None:
         elif v.bearing is None or not (v.why or "").strip():
             raise AmbidError("--acknowledge needs the name of the BEARING, and --why. Give them")
         until = None if v.until is None else moment(v.until, "until")
+        if until is not None and until <= time.time():
+            raise AmbidError(f"{setting('until', v.until)} is over already. Give a later time")
         if v.bearing is None and v.alarms is None:
             refuse_given(v.only("json plot report strict"), "{} is for one bearing. Name it, or omit {}")
         with open_ledger(v.ledger, write=v.acknowledge is not None, make=False) as found:

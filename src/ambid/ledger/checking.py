@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from ambid.errors import counted, listed
-from ambid.ledger.entry import key_of
+from ambid.ledger.entry import key_of, tables
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -44,6 +44,17 @@ def faults(c: Connection) -> tuple[str, ...]:
 
 
 def _faults(c: Connection) -> Iterator[str]:
+    from sqlalchemy import inspect
+
+    known = inspect(c)
+    names = set(known.get_table_names())
+    for table in tables().sorted_tables:
+        columns = {x["name"] for x in known.get_columns(table.name)} if table.name in names else set()
+        lacks = [x.name for x in table.c if x.name not in columns]
+        if lacks:
+            what = f"columns {', '.join(lacks)}" if columns else "all of it"
+            yield f"table {table.name!r} is damaged: it lacks {what}"
+            return
     if c.dialect.name == "sqlite":
         words = [str(row[0]) for row in c.exec_driver_sql("PRAGMA integrity_check(5)")]
         yield from (f"SQLite: {text}" for text in words if text != "ok")

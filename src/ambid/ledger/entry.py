@@ -50,6 +50,7 @@ KINDS: Mapping[str, Mapping[str, str]] = {
 """What the kinds of `STEPS` are called, by engine."""
 
 
+_YEARS = 1900, 3000  # from, and before, which records are taken
 OWN = " "  # first letter of bearings of the ledger's own, which no name of a user's begins with
 REMOVED = f"{OWN}removed"
 ARCHIVED = f"{OWN}archived"  # whose values, events and documents are in another ledger
@@ -297,11 +298,12 @@ def moment(text: str, name: str = "taken_at") -> float:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
+        time = datetime.min
+    if not _YEARS[0] <= time.year < _YEARS[1]:
         raise AmbidError(
             f"{setting(name)} is {text!r:.40}; it must be a date and time such as 2026-03-01T14:30 (UTC, or with an "
-            "offset). "
-            "Correct it"
-        ) from None
+            f"offset), from {_YEARS[0]} to {_YEARS[1] - 1}. Correct it"
+        )
     return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).timestamp()
 
 

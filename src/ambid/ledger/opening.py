@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -201,6 +202,10 @@ def in_one_line(ledger: str) -> Iterator[None]:
     drivers = [DBAPIError, sqlite3.Error, *(m.Error for m in [sys.modules.get("psycopg")] if m is not None)]
     try:
         yield
+    except zlib.error as failure:
+        raise AmbidError(
+            f"ledger {ledger} is damaged: {failure}. 'ambid ledger check' tells where; restore a backup"
+        ) from None
     except tuple(drivers) as failure:
         reason = str(getattr(failure, "orig", None) or failure).strip().splitlines()[0]
         if "locked" in reason:

@@ -40,7 +40,7 @@ def take_note(
     from sqlalchemy import insert
 
     standing = [a for a in alarms if a.cleared is None]
-    own = tuple(a for a in standing if rule in (a.rule, a.parameter))
+    own = tuple(a for a in standing if rule and rule in (a.rule, a.parameter))
     if not own:
         known = sorted({a.rule for a in standing})
         there = f"those that stand: {choices(rule, known)}" if known else "none stands."

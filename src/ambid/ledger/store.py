@@ -376,10 +376,8 @@ class Ledger:
         AmbidError
             If the other one is no ledger.
         """
-        with readable(other) as source:
-            self._refuse_itself(source)
-            with source._reading() as c0, self._writing(alone=True) as c:
-                return copying.merge(c0, c, source.shown, who=who, why=why)
+        with self._sound(other) as source, source._reading() as c0, self._writing(alone=True) as c:
+            return copying.merge(c0, c, source.shown, who=who, why=why)
 
     def backup(self, path: str | Path) -> int:
         """Write all that is here into a file of SQLite; one that is there is replaced once the new one is whole.
@@ -398,7 +396,7 @@ class Ledger:
         AmbidError
             If the file cannot be written.
         """
-        if str(Path(path).resolve()) == self._identity:
+        if _place(path) == self._identity:
             raise AmbidError(f"{path} is the ledger itself. Give another file")
         with self._reading() as c0, _new_file(Path(path)) as new:
             with new._writing() as c:
@@ -425,13 +423,8 @@ class Ledger:
         AmbidError
             If the backup is no ledger, or is damaged: all stays as it was.
         """
-        with readable(backup) as source:
-            self._refuse_itself(source)
-            wrong = source.check()
-            if wrong:
-                raise AmbidError(f"{source.shown} is damaged: {wrong[0]}. Restore another backup")
-            with source._reading() as c0, self._writing(alone=True) as c:
-                return copying.restore(c0, c, source.shown, who=who, why=why)
+        with self._sound(backup) as source, source._reading() as c0, self._writing(alone=True) as c:
+            return copying.restore(c0, c, source.shown, who=who, why=why)
 
     def retain(
         self, archive: str | Path, *, before: float, keep: Keep = "none", who: str = "", why: str = ""
@@ -572,6 +565,16 @@ class Ledger:
         with in_one_line(self.shown), closing(self._engine.raw_connection()) as raw:
             raw.cursor().execute(statement).fetchall()
 
+    @contextmanager
+    def _sound(self, where: str | Path) -> Iterator[Ledger]:
+        """Open another ledger to copy from; refuse one that is damaged."""
+        with readable(where) as source:
+            self._refuse_itself(source)
+            wrong = source.check()
+            if wrong:
+                raise AmbidError(f"{source.shown} is damaged: {wrong[0]}. Give another backup")
+            yield source
+
     def _refuse_itself(self, other: Ledger) -> None:
         if self._identity == other._identity:
             raise AmbidError(f"{other.shown} is the ledger itself. Give another")
@@ -581,11 +584,21 @@ class Ledger:
         """What no other ledger has: of a file its place, of a database its name and the start of its server."""
         query = "SELECT current_database() || pg_postmaster_start_time()" if self._postgres else "PRAGMA database_list"
         with self._reading() as c:
-            return str(c.exec_driver_sql(query).all()[0][0 if self._postgres else 2])
+            row = c.exec_driver_sql(query).all()[0]
+            return str(row[0]) if self._postgres else _place(row[2])
 
     @property
     def _postgres(self) -> bool:
         return self._engine.dialect.name == "postgresql"
+
+
+def _place(path: str | Path) -> str:
+    """Name a file by where it lies on the disk, whatever its links are called; "" where there is none."""
+    try:
+        at = Path(path).stat()
+    except OSError:
+        return ""
+    return f"{at.st_dev} {at.st_ino}"
 
 
 def _as_corrected(c: Connection, entries: Mapping[str, Entry]) -> dict[str, Entry]:
@@ -690,10 +703,14 @@ def readable(where: str | Path) -> Iterator[Ledger]:
 @contextmanager
 def _new_file(path: Path) -> Iterator[Ledger]:
     """Open a new ledger that is put in place of a file once it is whole."""
+    if not path.resolve().parent.is_dir():
+        raise AmbidError(
+            f"{path} cannot be written: there is no folder {path.parent}. Make it first, or correct the path"
+        )
     if path.exists():
         try:
             check_file(path)
-        except AmbidError:
+        except (AmbidError, OSError):
             raise AmbidError(f"{path} exists, and is not a ledger of ambid. Give another file") from None
     log = Path(f"{path}-wal")
     if log.exists() and log.stat().st_size:
