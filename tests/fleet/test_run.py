@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 import ambid
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, CircumstanceError
 from ambid.fleet.run import job_of, run_fleet
 from ambid.fleet.sources import fit_for_ledger, items
 from ambid.ledger import open_ledger
@@ -224,6 +225,15 @@ def test_what_says_nothing_of_a_record_is_not_remembered(tmp_path):
     first = run_fleet([tmp_path / "1.txt"], **where)
     assert "does not say when it was taken" in first.rows[0].reason
     assert run_fleet([tmp_path / "1.txt"], **where, taken_at="file").counts["done"] == 1
+
+
+def test_a_record_that_is_gone_when_its_turn_comes_is_not_remembered(tmp_path):
+    path = tmp_path / "1.txt"
+    path.write_text("1")
+    (item,) = items([path], None, "file")
+    path.unlink()
+    with pytest.raises(CircumstanceError, match=r"1.txt is gone since the fleet began"):
+        job_of(judge, {}, stored=True)(SimpleNamespace(item=item))
 
 
 def test_the_time_in_a_record_counts(tmp_path):

@@ -85,7 +85,10 @@ class JobOf:
 
     def __call__(self, task: _Task) -> _Found:
         """Do one record."""
-        item, when = task.item, task.item.when() if self.stored else None
+        item = task.item
+        if not item.remote and isinstance(item.source, (str, Path)) and not Path(item.source).is_file():
+            raise CircumstanceError(f"record {item.name} is gone since the fleet began. Put it back, and run again")
+        when = item.when() if self.stored else None
         with item.here(task.sha) as record:
             if self.stored and when is None and item.remote:  # what lies here was looked at before
                 said = started_in(record)
