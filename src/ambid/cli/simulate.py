@@ -37,6 +37,8 @@ def command(v: Values) -> None:
         refuse_given(of_excitation, "--scenario takes no {}. Omit {}")
         _run_scenario(v, preset)
         return
+    if v.run_up is not None:
+        refuse_given(v.only("excitation_only"), "--run-up takes no {}. Omit {}")
     if not v.nonlinear:
         refuse_given(v.only("position"), "{} is for --nonlinear. Omit {}")
     with Outputs(None if preset else Path(v.rig)) as outputs, progress("simulate"):

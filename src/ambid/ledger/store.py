@@ -572,7 +572,7 @@ class Ledger:
             self._refuse_itself(source)
             wrong = source.check()
             if wrong:
-                raise AmbidError(f"{source.shown} is damaged: {wrong[0]}. Give another backup")
+                raise AmbidError(f"{source.shown} is damaged: {wrong[0]}. Restore another backup of it")
             yield source
 
     def _refuse_itself(self, other: Ledger) -> None:
