@@ -14,8 +14,8 @@ from ambid.signals import excitation
 from ambid.simulation import Simulation, simulate_preset
 
 SEED = 3
-DURATION_S = 0.2
-AMPLITUDE_V = 20.0
+DURATION_S = 0.1
+AMPLITUDE_V = 40.0
 BAND_HZ = (5.0, 2000.0)
 
 # As a data logger would: header, factor from SI, digits after the point.

@@ -274,7 +274,7 @@ def demo() -> Figure:
     free = [p for p in estimate.parameters if p.role == "free"]
     figure = plt.figure(figsize=(9.0, 3.0), layout="constrained")
     left, right = figure.subfigures(1, 2)
-    left.suptitle("in: 0.2 s of a levitated rotor", fontsize=10)
+    left.suptitle("in: 0.1 s of a levitated rotor", fontsize=10)
     channels = zip(
         left.subplots(3, 1, sharex=True),
         (("voltage", 1.0, "V"), ("current", 1e3, "mA"), ("position", 1e6, "µm")),

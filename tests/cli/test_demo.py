@@ -26,7 +26,7 @@ def test_the_embedded_record_is_what_its_recipe_gives():
 def test_the_embedded_record_is_sound():
     assert demo_simulation().warnings == ()
     with gzip.open(str(demo_file("demo.csv.gz")), "rt") as file:
-        assert len(file.readlines()) == 4002
+        assert len(file.readlines()) == 2002
 
 
 def test_the_rig_of_the_demo_knows_nothing(tmp_path):

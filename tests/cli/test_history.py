@@ -33,7 +33,7 @@ def test_the_same_record_rig_settings_and_version_is_kept_once(demo, ambid, monk
         "nothing was added\n"
     )
     assert "stored in" in ambid(*WORDS, "--taken-at", "2026-04-01", "--from", "0.05").err  # other settings
-    tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start", "0.1")
+    tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start", "0.05")
     assert (tracked.code, "stored in" in tracked.err) == (0, True)
     with open_ledger("l.db", write=False) as ledger:
         found, every = ledger.history("pump 1"), ledger.history("pump 1", every=True)

@@ -27,7 +27,7 @@ _INSIDE = 3.29  # standard deviations of a 99.9 % interval
 def command() -> None:
     """Identify the embedded record and print the estimate beside the truth.
 
-    The record: 0.2 s of an unstable bearing levitated by a PID controller, simulated with noise. No parameter is given.
+    The record: 0.1 s of an unstable bearing levitated by a PID controller, simulated with noise. No parameter is given.
     """
     from ambid.job.identification import demo
     from ambid.physics.presets import preset
