@@ -18,6 +18,7 @@ def doubled(bench, record_text):
     (bench / "two.csv").write_text("\n".join([f"{header},gap [um]", *rows]) + "\n")
 
 
+@pytest.mark.drawn
 def test_it_says_why_and_draws(bench, ambid, doubled):
     made = ambid("init", "two.csv", "-o", "new.toml", "--plot", "new.png", "--yes")
     assert made.code == 0

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -145,7 +146,7 @@ def bench(tmp_path_factory):
 def test_a_record_is_identified_from_the_page(bench, tmp_path):
     from ambid import simulate
 
-    for file in bench.iterdir():
+    for file in filter(Path.is_file, bench.iterdir()):  # another test's console may have run there
         shutil.copy(file, tmp_path)
     from ambid.record import write_record
 
@@ -202,9 +203,10 @@ def test_a_ledger_is_shown_over_time_without_numbers_that_are_not_known(tmp_path
         assert "is not a ledger" in told(look("other.db"), "end")[0]["why"]
         assert page.ask("POST", "/api/previews", {"job": "history"}).status == 400
     with open_ledger(tmp_path / "works.db", write=False) as ledger:
-        a = drawn(ledger.history("A"))
+        found = ledger.history("A")
+        a = drawn(found)
     assert sorted(tmp_path.iterdir()) == before
-    assert [a["bearing"], a["verdict"], len(a["estimates"])] == ["A", "caution", 3]
+    assert [a["bearing"], found.verdict.word, len(a["estimates"])] == ["A", "caution", 3]
     assert a["series"]["k_i"]["value"] == [80.0, 80.0, None]
     assert a["series"]["R"]["value"] == [4.2, None, None]
     assert a["series"]["R"]["half"][1:] == [None, None]

@@ -168,6 +168,7 @@ def test_the_unstable_pole_is_named(drawn):
     assert text.count("unstable, time constant") == 1
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize(("kind", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_figures_are_written_and_equal_ones_are_equal(unstable, drawn, kind, magic):
     files = []
