@@ -2,12 +2,12 @@
 
 import os
 import shutil
-from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
 from io import FileIO
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
