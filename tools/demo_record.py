@@ -22,14 +22,14 @@ BAND_HZ = (5.0, 2000.0)
 _COLUMNS = (("voltage", "V", 1.0, 2), ("current", "mA", 1e3, 1), ("position", "um", 1e6, 2))
 
 
-def demo_simulation() -> Simulation:
+def demo_simulation(duration_s: float = DURATION_S, amplitude: float = AMPLITUDE_V) -> Simulation:
     """Simulate the bench of the demo: the unstable bearing under its PID, with process and sensor noise.
 
     Returns its `truth` is what the demo compares with.
     """
     bench = preset(PRESET)
-    n = round(DURATION_S * bench.rate_hz)
-    u = excitation("multisine", n, bench.rate_hz, amplitude=AMPLITUDE_V, band=BAND_HZ, seed=SEED)
+    n = round(duration_s * bench.rate_hz)
+    u = excitation("multisine", n, bench.rate_hz, amplitude=amplitude, band=BAND_HZ, seed=SEED)
     return simulate_preset(bench, u, seed=SEED)
 
 

@@ -1,6 +1,5 @@
 """A short record and its rig, from the embedded demo, and the command run in this process."""
 
-import gzip
 import os
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import pytest
 
 from ambid.cli import run
 from ambid.cli.demo import demo_file
+from tools.demo_record import demo_csv, demo_simulation
 
 ROWS = 3000
 
@@ -37,8 +37,8 @@ def ambid(capsys):
 
 @pytest.fixture(scope="session")
 def record_text():
-    """The first 0.15 s of the demo's record: comment, header, rows."""
-    lines = gzip.decompress(demo_file("demo.csv.gz").read_bytes()).decode().splitlines()
+    """The first 0.15 s of a record as the demo's, longer and smaller: comment, header, rows."""
+    lines = demo_csv(demo_simulation(0.4, 20.0)).splitlines()
     return "\n".join(lines[: ROWS + 2]) + "\n"
 
 
