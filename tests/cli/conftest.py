@@ -1,4 +1,4 @@
-"""A short record and its rig, from the embedded demo, and the command run in this process."""
+"""A short record as that of the demo, its rig, and the command run in this process."""
 
 import os
 from dataclasses import dataclass
