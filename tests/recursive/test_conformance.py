@@ -187,11 +187,12 @@ def test_covariance_stays_sound_through_long_silence_and_after(case: Case) -> No
 
 
 def test_memory_does_not_grow(case: Case) -> None:
+    """Less than a byte for every 32 samples: what is found now and then (a drift that may have begun) has a bound."""
     estimator = fed(case)
     before = len(pickle.dumps(estimator))
     for seed in range(4):
         estimator.update(*case.signals(2 * case.n, seed))
-    assert len(pickle.dumps(estimator)) <= before + 64
+    assert len(pickle.dumps(estimator)) <= before + max(64, case.n // 4)
 
 
 def test_an_empty_block_changes_nothing(case: Case) -> None:
