@@ -30,6 +30,7 @@ _ELSEWHERE = (
 )  # not for a transcript: set-up, and what waits for people
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _NUMBER = re.compile(r"[-+−]?\d[\d.]*(e[+-]\d+)?( [numkM]?(?=[mAVN]\b))?")
+_FARTHEST = re.compile(r"moves (?:position|current|voltage)\b")
 _DEVIATION = re.compile(r"([-−]?\d[\d.]*) ± ([\d.]+)")
 
 
@@ -86,8 +87,11 @@ def refreshed(shown: str, printed: str) -> tuple[str, list[str]]:
 def differences(shown: str, printed: str, *, scatters: bool = False) -> list[str]:
     """Return what a reader would miss: lines whose words are not printed, and values beyond 2 standard deviations.
 
-    Where another rounding is another run, as of a rotor that levitates, both scatter (`scatters`): 3 of both together.
+    Where another rounding is another run, as of a rotor that levitates, both scatter (`scatters`): 3 of both together,
+    and whichever channel moves farthest.
     """
+    if scatters:
+        shown, printed = (_FARTHEST.sub("moves it", text) for text in (shown, printed))
     left = iter(printed.splitlines())
     found = []
     for line in filter(str.strip, shown.splitlines()):
