@@ -22,8 +22,6 @@ SIGMA = 0.2
 ORDERS = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nf": 2, "nk": 1, "n": 2}
 _OWN = {
     "fir": {"nb": 40},
-    "rfir": {"nb": 60},
-    "correlation": {"nb": 40},
     "arx": {"na": 6, "nb": 6},  # long enough for the moving average of the noise
     "oe": {},
     "bj": {"nd": 2},
@@ -31,7 +29,6 @@ _OWN = {
     "arma": {},
     "srivc": {"nk": 0},  # what is sampled with a hold comes a sample later
     "clsrivc": {"nk": 0},
-    "weakform": {"na": 2, "nb": 2, "nk": 0},
     "blocks": {"nk": 0},
 }
 

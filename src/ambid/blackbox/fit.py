@@ -112,13 +112,8 @@ STRUCTURES = _register(
      f"{_INNOVATIONS}, subspace from a long autoregression; consistent in closed loop"),
     ("sspem", "state space", "state_space_search", "n", "with noise model",
      f"{_INNOVATIONS} by prediction error: statistically efficient"),
-    ("rfir", "polynomial", "impulse", "nb nk", "biased", "y = B u + e, many taps with a decaying prior"),
-    ("correlation", "polynomial", "impulse", "nb nk", "biased",
-     "y = B u + e, taps by correlation with the whitened input"),
     ("blocks", "transfer function", "blocks", "nk", "consistent",
      "i = K_a/(s+a) u + K_b/(s+b) x, x = K_c/(s+c) i, continuous time (mass 1, no inertia)"),
-    ("weakform", "transfer function", "weak_form", "nb nf nk", "biased",
-     "y = B(s)/F(s) u + white noise, continuous time, by test functions"),
 )  # fmt: skip
 
 # Fitted to a measured frequency response (`FrequencyResponse`) instead of to inputs and outputs: their estimators take

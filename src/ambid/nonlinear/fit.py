@@ -409,7 +409,6 @@ NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {
         "narx": "neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
         "lpv": "linear model whose coefficients follow a scheduling signal such as the set point; error model",
         "hybrid": "polynomial, network for its residual, noise model C (thesis eqs 3.23-3.24)",
-        "hammerstein": "static polynomial of each input, then a linear difference equation",
         "rbf": "radial basis functions of lagged outputs and inputs, with a linear part (thesis eqs 1.13-1.14)",
     }.items()
 }
@@ -475,7 +474,6 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "narx": "ambid.nonlinear.narx:NarxFunction.read_model",
-        "hammerstein": "ambid.nonlinear.hammerstein:HammersteinFunction.read_model",
         "lpv": "ambid.nonlinear.lpv_model:LpvModel.from_json",
     }
 )
