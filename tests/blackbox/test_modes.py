@@ -9,7 +9,6 @@ import pytest
 
 from ambid.blackbox.mode_starts import excited_band, spectra
 from ambid.blackbox.modes import _Window, find_modes
-from ambid.blackbox.operational import operational_modes
 from ambid.errors import EstimationError
 from ambid.estimation.modes import mac
 from tests.blackbox.sweeps import RATE, io, structure, sweep
@@ -197,30 +196,3 @@ def test_gradient_of_the_projected_likelihood_is_exact(record):
         h = 1e-3 * lines.step * way * np.array([1.0, 0.0])
         up, down = (window.project(poles + s * h).cost for s in (1, -1))
         assert gradient[k] == pytest.approx((up - down) / 2e-3, rel=1e-5)
-
-
-@pytest.fixture(scope="module")
-def alone():
-    """A minute of noise that nobody measured, with hum."""
-    rng = np.random.default_rng(10)
-    y, _ = structure(MODES[::4], rng.standard_normal(60000), rng, n_outputs=3, hum=0.3)
-    return operational_modes(io(y))
-
-
-def test_operational_modes_are_found_without_input(alone):
-    for f, damping in MODES[::4]:
-        m = min(alone.modes, key=lambda m: abs(m.frequency_hz.value - f))
-        assert abs(m.frequency_hz.value - f) < 4 * m.frequency_hz.sd < 0.02 * f
-        assert abs(m.damping.value - damping) < 4 * m.damping.sd < 4 * damping
-
-
-def test_a_harmonic_is_no_mode(alone):
-    lines = [m for m in alone.modes if min(abs(m.frequency_hz.value - x) for x in (50.0, 150.02)) < 0.1]
-    assert lines
-    assert not any(m.identifiable for m in lines)
-    assert not alone.checks["modes_random"].passed
-
-
-def test_operational_modes_want_a_band_of_lines():
-    with pytest.raises(EstimationError, match="operational modes want"):
-        operational_modes(io(np.random.default_rng(1).standard_normal((2000, 2))), band=(10.0, 12.0))

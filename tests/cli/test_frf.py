@@ -280,22 +280,12 @@ def test_modes_are_found_without_a_rig_and_stand_in_the_file(tmp_path, sweep_tex
     assert len(again.to_dataframe()) == again.response.frequency_hz.size
 
 
-def test_outputs_alone_give_operational_modes(tmp_path, sweep_text, ambid, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("sweep.csv").write_text(sweep_text, encoding="utf-8")
-    found = ambid("frf", "sweep.csv", *MODES, "2", "--json", "m.json", "--plot", "m.png", "--band", "20:200")
-    assert found.code == 0
-    assert json.loads(Path("m.json").read_text())["schema"] == "ambid.modes/1"
-    assert "operational modes" in load("m.json").summary()
-    assert Path("m.png").read_bytes().startswith(PNG)
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("--input", "current", *MODES, "few"), "--modes is 'few'; it must be a number of modes, or auto"),
         (("--input", "current", "--output", "a0", "--estimate", "e.json"), "--estimate is for --modes"),
-        ((*MODES, "auto", "--state-space", "n=2"), "a model was requested, and no input was named"),
+        ((*MODES, "auto"), "no input was named"),
         (("--input", "current", *MODES, "auto", "--band", "60:61"), "lines of the record between 60 and 61 Hz"),
     ],
 )

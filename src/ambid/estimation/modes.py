@@ -288,13 +288,13 @@ def mac(ones: Sequence[Mode], others: Sequence[Mode], outputs: Sequence[str] | N
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Modal(Judged):
-    """Modes of a record, file schema ``ambid.modes/1``; in a response's file ``modes``, and the rest as ``modal``."""
+    """Modes of a record; in a response's file ``modes``, and the rest as ``modal``."""
 
     status: Literal["converged", "failed"]  # "failed" where no mode was found
     method: str
     modes: tuple[Mode, ...]  # in order of frequency
     checks: Mapping[str, Check]
-    inputs: tuple[str, ...]  # none: operational modes
+    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     units: Mapping[str, str]
     band_hz: tuple[float, float]  # that was searched

@@ -381,7 +381,6 @@ _KINDS: Mapping[str, Kind] = {
     "Commissioned": Kind(describe=_commissioned, write=_dumps),
     "Track": Kind(describe=_track, write=_written("tracking.lines_file.track_document"), beside=_followed),
     "Validation": Kind(describe=_validation, write=partial(_fields, "ambid.validation/1")),
-    "Modal": _whole("response.modal_document", "modes"),
     "Margins": _whole("margins.margins_document", "margins"),
     "Acceptance": _whole("acceptance.acceptance_document", "acceptance"),
     "Experiment": _whole("experiment.experiment_document", "experiment"),

@@ -20,7 +20,6 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.mode_starts import MOST_DAMPED
 from ambid.blackbox.model import Offsets
 from ambid.blackbox.modes import find_modes
-from ambid.blackbox.operational import operational_modes
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import Modal, plant_modes
@@ -66,7 +65,7 @@ def frf(
     units: Mapping[str, str] | None = None,
     layout: Mapping[str, str] | None = None,
     tick: Tick | None = None,
-) -> Measured | Modal:
+) -> Measured:
     """Measure a frequency response from one record, and fit models to it; find the modes of vibration.
 
     Parameters
@@ -94,8 +93,7 @@ def frf(
         Whether that state space has a direct path D; in z, one within a sample.
     modes : int or "auto", optional
         Find so many modes, or all that the record shows: poles common to all outputs, by maximum likelihood on the
-        record's own spectrum. Without an input: operational modes, by stochastic subspace. Without `band`, those where
-        the input (without one, the outputs) has power.
+        record's own spectrum. Without `band`, those where the input has power.
     estimate : result, str or Path, optional
         With `modes`: a physical estimate whose modes stand beside those found, with the modal assurance criterion.
     domain : {"s", "z"}, optional
@@ -115,7 +113,6 @@ def frf(
     Returns
     -------
     Measured
-        Without an input: a Modal, modes alone.
 
     Raises
     ------
@@ -161,18 +158,11 @@ def frf(
         return _judged(
             response, channels, about, offsets, clock, say, wanted, state_space, feedthrough, domain, delay, modal=None
         )
-    alone = bench is None and not channels.inputs
-    if alone and modes is None:
+    if bench is None and not channels.inputs:
         raise EstimationError(f"no input was named; a response needs at least one. Give {setting('input', 'COLUMN')}")
-    if alone and (orders is not None or state_space is not None):
-        raise EstimationError(f"a model was requested, and no input was named. Give {setting('input', 'COLUMN')}")
     data = channels.read(record, (from_s, to_s))
     clock.lap("read")
     modal: Modal | None = None
-    if modes is not None and not data.inputs:
-        modal = _beside(operational_modes(data, modes, band=band, tick=say), known)
-        clock.lap("modes")
-        return replace(modal, timing_s=clock.laps)
     if modes is not None:
         modal = _beside(find_modes(data, modes, band=band, tick=say), known)
         clock.lap("modes")

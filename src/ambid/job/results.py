@@ -156,7 +156,6 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.agreement/1": _whole("validation.agreement", "Agreement", "compare"),
     "ambid.acceptance/1": _whole("control.acceptance", "Acceptance", "accept"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
-    "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_record", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
     "ambid.acquisition/1": _whole("acquisition.session", "Acquired", "acquire"),

@@ -49,7 +49,7 @@ from ambid.report.fit_figures import pole_parts
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
 from ambid.report.parameters import short_numbers
 from ambid.report.response_panels import Complex, Pair, angle_ticks, magnitude_axis, pairs_panel, phase_axis, unwrapped
-from ambid.report.text import Cell, Line, other_warnings, plain, status_words, title_line, wrapped
+from ambid.report.text import Cell, Line, plain, status_words, title_line, wrapped
 from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 from ambid.validation.orders import Stabilisation
@@ -245,26 +245,6 @@ def warnings_of(measured: Measured) -> list[str]:
 
 
 # --- modes ----------------------------------------------------------------------------------------------------------
-
-
-def modal_document(modal: Modal, _: Any) -> Document:
-    """Describe modes that were found without a response."""
-    return Document(
-        title=f"{RecordEntry.of(modal.record).name}, {len(modal.modes)} modes", sections=modal_sections(modal),
-        figure=partial(modal_figure, modal), frame=mode_table(modal.modes).frame,
-    )  # fmt: skip
-
-
-def modal_sections(modal: Modal) -> list[Section]:
-    """Say what modes were found without a response: what from, the table, checks."""
-    head = title_line(RecordEntry.of(modal.record), "operational modes", modal.status)
-    about = f"of {', '.join(modal.outputs)}; {modal.method}"
-    return [
-        Section(parts=[Lines(lines=[head], wrap=False), Lines(lines=[about])]),
-        *mode_sections(modal),
-        Section(parts=[Warnings(warnings=other_warnings(modal.checks, modal.warnings))]),
-        timing_section(modal.timing_s),
-    ]
 
 
 def mode_sections(modal: Modal) -> list[Section]:
@@ -576,8 +556,3 @@ def _draw_shapes(axes: Axes, modal: Modal) -> None:
     axes.set_xticks(at, modal.outputs, rotation=45)
     axes.set_yticks(range(len(modal.modes)), [sized(m.frequency_hz.value, "Hz") for m in modal.modes])
     head(axes, "shapes")
-
-
-def modal_figure(modal: Modal, width: float = WIDE) -> Figure:
-    """Draw modes that were found without a response."""
-    return stacked(f"{modal.record.get('file') or 'record'}: operational modes", [modal_panel(modal)], width)

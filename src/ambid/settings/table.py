@@ -252,8 +252,7 @@ SETTINGS = (
         "modes",
         "text",
         "auto|N",
-        "Find modes of vibration by maximum likelihood: frequency, damping, shape over the outputs; N: so"
-        " many. Without @input: operational modes.",
+        "Find modes of vibration by maximum likelihood: frequency, damping, shape over the outputs; N: so many.",
     ),
     Setting("no_browser", "switch", "", "Print the link only."),
     Setting(
