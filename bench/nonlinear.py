@@ -62,23 +62,11 @@ SILVERBOX = (
         settings={**_LAGS, "ne": 0, "degree": 3, "neurons": 4, "starts": 1},
     ),
 )  # fmt: skip
-_DRIVES = {"ny": 3, "nu": 3, "output": "magnitude", "criterion": "bic", "symmetry": "odd"}
-DRIVES = (
-    Way(name="narmax, linear, magnitude", structure="narmax", settings={**_DRIVES, "degree": 1}),
-    Way(name="narmax, degree 3, magnitude", structure="narmax", settings={**_DRIVES, "degree": 3}),
-    Way(
-        name="nn, linear, magnitude",
-        structure="nn",
-        settings={"output": "magnitude", "neurons": 0},
-    ),
-    Way(name="nn, magnitude: states and units as it chooses", structure="nn", settings={"output": "magnitude"}),
-)
 
 
 def nonlinear_tables() -> Iterator[Table]:
     yield _thesis_table()
     yield _silverbox_table()
-    yield _drives_table()
 
 
 def fitted(way: Way, record: IOData) -> tuple[NonlinearFit, float]:
@@ -186,41 +174,6 @@ def _silverbox_table() -> Table:
             "Published: 0.44 % of the deviation for a nonlinear state-space model (linear fractional, cubic) on the"
             " data that it was trained on, the example of the package freq_statespace. About 7.7 mV is quoted for a"
             " polynomial NARX model on the multisine; its source was not found.",
-        ),
-        data={"cases": data},
-    )
-
-
-def _drives_table() -> Table:
-    rows, data = [], []
-    records = {k: read(f"coupled_drives_{k}.csv") for k in (1, 2, 3)}
-    for way in DRIVES:
-        cells = []
-        for k, whole in records.items():
-            fit, took = fitted(way, whole.part(0, 250))
-            rms, part = free_run(fit, whole, 250)
-            cells.append(f"{rms:.4f} ({100 * part:.0f} %), {quantity(took, 's')}")
-            data.append(
-                {"way": way.name, "record": k, "rms": rms, "relative": part, "seconds": took,
-                 "settings": {n: fit.settings.get(n) for n in ("states", "neurons")}, "status": fit.status}
-            )  # fmt: skip
-        rows.append((way.name, *cells))
-    return Table(
-        group="Coupled electric drives: speed without sign",
-        columns=("model", "record 1 (±1 V)", "record 2 (±1.5 V)", "record 3 (±0.5 V)"),
-        rows=tuple(rows),
-        before=(
-            "Samples 0 to 250 of each record are fitted, all choices made on them; the free run goes on over samples"
-            " 250 to 500, which count: root mean square error, in standard deviations of the output, and the time that"
-            " the fit takes. The first samples of the record (9 for narmax, 20 for nn) begin the run."
-        ),
-        remarks=(
-            "These are the three records with a binary input of Wigren and Schoukens (2017). The benchmark's own rule"
-            " (package nonlinear_benchmarks) is for the two others, with inputs of random amplitude, of which samples"
-            " 400 to 500 are judged. 0.103 and 0.107 are quoted for two records of this plant; for which"
-            " ones was not found.",
-            "Defaults of the magnitude network (its prior, folds and margins) were settled while its errors on these"
-            " halves were known; the method itself does not see them.",
         ),
         data={"cases": data},
     )

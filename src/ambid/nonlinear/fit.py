@@ -472,7 +472,6 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
         "hybrid": "ambid.nonlinear.hybrid:HybridFunction.read_model",
         "rbf": "ambid.nonlinear.rbf:RbfFunction.read_model",
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
-        "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "narx": "ambid.nonlinear.narx:NarxFunction.read_model",
         "lpv": "ambid.nonlinear.lpv_model:LpvModel.from_json",
     }

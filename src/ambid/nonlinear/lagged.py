@@ -408,7 +408,6 @@ class Rows:
     """A record, or part of it, as a function sees it, from sample `lag` on."""
 
     z: Array  # (n_samples, n_columns), all signals, those before included
-    first: int  # sample of the first row
     x: Array  # (n, n_regressors)
     y: Array  # (n, n_outputs), measured
     prepared: tuple[tuple[Array, ...], ...]  # by block
@@ -416,7 +415,7 @@ class Rows:
     def part(self, span: slice) -> Rows:
         """Return some of the rows."""
         prepared = tuple(tuple(a[span] for a in one) for one in self.prepared)
-        return Rows(z=self.z, first=self.first + (span.start or 0), x=self.x[span], y=self.y[span], prepared=prepared)
+        return Rows(z=self.z, x=self.x[span], y=self.y[span], prepared=prepared)
 
 
 class LaggedFunction(ABC):
@@ -424,7 +423,6 @@ class LaggedFunction(ABC):
 
     kind: ClassVar[str]
     ellipsoid: ClassVar[bool] = False  # whether the ellipsoid alone says where it was trained
-    folded: bool = False  # whether the sign of the output is not measured, see `kernels.run`
 
     @property
     @abstractmethod
@@ -479,10 +477,6 @@ class LaggedFunction(ABC):
         x = self.regressors
         return np.flatnonzero(x.column < x.n_outputs + x.n_inputs) if x.noisy.size else slice(None)
 
-    def training_rows(self, theta: Array, rows: Rows) -> Array:
-        """Return the regressors of rows that its cloud is made of, outputs with the signs of their predictions."""
-        return (self.predict(theta, rows)[1] if self.folded else rows).x[:, self.in_cloud]
-
     def unit(self, y_scale: Array, u_scale: Array) -> Array | float:
         """Return what a scaled parameter of 1 is in the model's `theta`."""
         del y_scale, u_scale
@@ -518,7 +512,7 @@ class LaggedFunction(ABC):
             block.prepare(x) if earlier is None or block.uses(noisy) else earlier.prepared[k]
             for k, block in enumerate(self.blocks)
         )
-        return Rows(z=z, first=self.lag, x=x, y=y[self.lag :], prepared=prepared)
+        return Rows(z=z, x=x, y=y[self.lag :], prepared=prepared)
 
     def values(self, theta: Array, rows: Rows) -> Array:
         """Return the function, shape (n, n_outputs)."""
@@ -541,7 +535,7 @@ class LaggedFunction(ABC):
     @cached_property
     def affine(self) -> bool:
         """Whether innovations enter without bends: then they follow from errors without them by a linear filter."""
-        return not self.folded and not any(b.bends(self.regressors.noisy) for b in self.blocks)
+        return not any(b.bends(self.regressors.noisy) for b in self.blocks)
 
     def predict(self, theta: Array, rows: Rows) -> tuple[Array, Rows]:
         """Return one-step predictions (n, n_outputs), NaN from where innovations diverge on, and the rows with their
@@ -551,7 +545,7 @@ class LaggedFunction(ABC):
         if z is None:
             return predictions, rows
         measured = np.concatenate([rows.z[: self.lag, : self.n_outputs], rows.y])
-        return predictions, self.rows_of(z, measured, None if self.folded else rows)
+        return predictions, self.rows_of(z, measured, rows)
 
     def errors(self, theta: Array, rows: Rows) -> Array:
         """Return one-step errors, shape (n, n_outputs), NaN from a divergence on."""
@@ -560,7 +554,7 @@ class LaggedFunction(ABC):
     def _predicted(self, theta: Array, rows: Rows) -> tuple[Array, Array | None]:
         """One-step predictions, and the signals with innovations in them if the model looks at any."""
         x, lag, p = self.regressors, self.lag, self.n_outputs
-        if not x.noisy.size and not self.folded:
+        if not x.noisy.size:
             return self.values(theta, rows), None
         z = rows.z.copy()
         if not self.affine:
@@ -581,17 +575,12 @@ class LaggedFunction(ABC):
 
     def free_run(self, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
         """Return a run on own outputs from `lag` on, (n_samples, n_outputs), NaN where diverged, and all signals behind
-        it, outputs with their signs also where the run has magnitudes.
+        it.
         """
         z = self.regressors.signals(y, u)
         out = self._run(theta, z, free=True)
         out[: self.lag] = y[: self.lag]
         return out, z
-
-    def first_sign(self, theta: Array, z: Array) -> float:
-        """Return the sign of first outputs of which only the magnitude is known."""
-        del theta, z
-        return 1.0
 
     def _run(self, theta: Array, z: Array, *, free: bool) -> Array:
         from ambid.nonlinear.kernels import run
@@ -605,9 +594,7 @@ class LaggedFunction(ABC):
         for block, own in zip(self.blocks, self.split(theta), strict=True):
             block.fill(own, numbers)
         out, x = np.empty((z.shape[0], p)), self.regressors
-        if self.folded:
-            z[: self.lag, :p] *= self.first_sign(theta, z)
-        shape = np.array([self.lag, p, p + x.n_inputs, int(free), int(self.folded)], dtype=np.int64)
+        shape = np.array([self.lag, p, p + x.n_inputs, int(free)], dtype=np.int64)
         run(z, x.column, x.back, shape, out, *numbers.values())
         return out
 
@@ -620,8 +607,8 @@ class LaggedFunction(ABC):
     def slopes(
         self, theta: Array, rows: Rows, *, free: bool, live: Mask | None = None, before: Array | None = None
     ) -> Array:
-        """Return the exact derivative (n, n_outputs, n_live) of predictions, or of a free run, whose `rows` these are;
-        see `fold`. `before`: that at rows right before, none where `rows` begin with the first.
+        """Return the exact derivative (n, n_outputs, n_live) of predictions, or of a free run, whose `rows` these are.
+        `before`: that at rows right before, none where `rows` begin with the first.
         """
         x = self.regressors
         at = x.own if free else x.noisy
@@ -634,13 +621,6 @@ class LaggedFunction(ABC):
         out = G if before is None else np.concatenate([before, G])
         propagate(out, np.ascontiguousarray(by_x if free else -by_x), *self._recurrence(at), first)
         return out[first:]
-
-    def fold(self, J: Array, rows: Rows) -> Array:
-        """Return slopes of what is measured from those of the outputs; they differ where that is a magnitude."""
-        if not self.folded:
-            return J
-        sign = np.copysign(1.0, rows.z[rows.first : rows.first + J.shape[0], : self.n_outputs])
-        return np.asarray(sign[:, :, None] * J)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -688,7 +668,7 @@ class LaggedModel(ScaledModel):
         if ys.shape[0] > self.lag:
             function, theta = self.function, self.scaled_theta
             _, rows = function.predict(theta, function.rows(ys, us))
-            out[self.lag :] = function.fold(function.slopes(theta, rows, free=False), rows)
+            out[self.lag :] = function.slopes(theta, rows, free=False)
         return out * (self.y_scale[:, None] / self.unit)
 
     def simulate(self, u: Array, y: Array) -> Array:
@@ -704,7 +684,7 @@ class LaggedModel(ScaledModel):
         ys, us = scaled(self, u, y)
         function, out = self.function, np.full(ys.shape[0], np.nan)
         if ys.shape[0] > self.lag:
-            out[self.lag :] = self.cloud.novelty(function.training_rows(self.scaled_theta, function.rows(ys, us)))
+            out[self.lag :] = self.cloud.novelty(function.rows(ys, us).x[:, function.in_cloud])
         return out
 
     def as_json(self) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from ambid.settings.caller import setting
 _BLOCK = 4096
 _LEAST = 1e-7  # standard deviation of errors, scaled
 _APART = 1e-8  # of correlation: errors of two outputs are never taken as the same
-_DEPENDENT = 1e-10  # squared length left of a column that others hold already
 _DRAWN_ON = 1000  # rows by which they are compared
 _LAGS = (1, 2, 3, 4, 6)  # that are compared
 _CROWDED = 0.8  # part of the errors that numbers may take up
@@ -110,7 +109,6 @@ class LaggedProblem:
                 J = function.slopes(theta, some, free=self.free, live=self.live, before=before)
                 if reach:
                     before = J[-reach:].copy() if before is None else np.concatenate([before, J])[-reach:]
-                J = function.fold(J, some)
                 yield k, np.matmul(self.weight, np.concatenate([J, left[part, :, None]], axis=2))
 
     def sample_rows(self, v: Array) -> list[Array]:
@@ -190,18 +188,6 @@ def whitening(noise: Array) -> Array:
     np.fill_diagonal(alike, 1.0)
     out: Array = np.linalg.inv(np.linalg.cholesky(alike)) / size
     return out
-
-
-def column_gains(R: Array, inside: Mask) -> Array:
-    """Return what each outside column explains of the last, orthogonal to those inside, by the triangle `R`; 0 where
-    nothing is left of it.
-    """
-    Q, left = np.linalg.qr(R[:, :-1][:, inside])[0], R[:, :-1][:, ~inside]
-    size, rest = np.sum(left**2, axis=0), R[:, -1] - Q @ (Q.T @ R[:, -1])
-    left = left - Q @ (Q.T @ left)
-    squared = np.sum(left**2, axis=0)
-    live = squared > _DEPENDENT * size
-    return np.asarray(np.where(live, (left.T @ rest) ** 2 / np.where(live, squared, 1.0), 0.0))
 
 
 def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:
@@ -492,7 +478,7 @@ def finish(
         whole = np.zeros((draft.theta.size, draft.theta.size))
         whole[np.ix_(problem.live, problem.live)] = covariance
         whole *= unit[:, None] * unit
-    x = np.concatenate([function.training_rows(draft.theta, r) for r in problem.rows()])
+    x = np.concatenate([r.x[:, function.in_cloud] for r in problem.rows()])
     model = LaggedModel(
         dt=records[0].dt, function=function, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
         y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x, ellipsoid=function.ellipsoid),

@@ -23,7 +23,6 @@ from ambid.nonlinear.narmax_choice import (
     NarmaxSettings,
     add_all_noise,
     add_noise_terms,
-    choose_by_simulation,
     is_sampled_fast,
     narmax_settings,
     process_terms,
@@ -61,8 +60,7 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     if not records:
         raise EstimationError("narmax: no record was given. Pass at least one")
     s = narmax_settings(settings, n_inputs=records[0].n_inputs)
-    data = scaled_records("narmax", records, lag=s.lag, levels="auto" if s.output == "signed" else "zero", fewest=10)
-    _check_magnitude(s, records)
+    data = scaled_records("narmax", records, lag=s.lag, levels="auto", fewest=10)
     # a linear model: something to hand over when the very next thing is an interruption
     linear = process_terms(replace(s, degree=1, ne=0, selection="frols"), data.parts, None)
     fitting = _Fitting(
@@ -79,19 +77,6 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     if reason or not np.isfinite(fitting.choice.cost(data.parts)):
         return fitting.failed(reason or DIVERGED)
     return _finish(s, fitting)
-
-
-def _check_magnitude(s: NarmaxSettings, records: Sequence[IOData]) -> None:
-    if s.output == "signed":
-        return
-    if (records[0].n_inputs, records[0].n_outputs) != (1, 1):
-        raise EstimationError(f"narmax: output = {s.output} is for one input and one output. Choose one of each")
-    for r, x in enumerate(records):
-        if np.min(x.y) < 0:
-            raise EstimationError(
-                f"narmax: output {x.outputs[0]!r} of record {r + 1} is negative at sample {int(np.argmin(x.y))}; a "
-                "magnitude is not. Use output = signed"
-            )
 
 
 def _fit_terms(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | None) -> None:
@@ -125,30 +110,22 @@ def _fit_terms(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | 
 
 def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | None) -> None:
     """All stages, one after the other; their shares of the time are a guess, right within a factor of some."""
-    by_run, free = s.selection == "simulation", s.focus == "simulation"
-    costs = (20.0 if by_run else 0.2, 1.5 * (s.kind == "rational"), 1.0 * bool(s.ne), 1.5, 1.0 * free)
+    free = s.focus == "simulation"
+    costs = (0.2, 1.5 * (s.kind == "rational"), 1.0 * bool(s.ne), 1.5, 1.0 * free)
     choosing, below, noise, pruning, last = portions(tick, costs)
     began = perf_counter()
-    if by_run:
-        choice = choose_by_simulation(s, parts, choosing, lambda x: fitting.take(x, free=True))
-    else:
-        choice = process_terms(s, parts, choosing)
+    choice = process_terms(s, parts, choosing)
     if s.kind == "rational":
         choice = rational_terms(s, choice, parts, part_of(below, 0.0, 0.5))
         choice = _search(parts, choice, fitting, part_of(below, 0.5, 1.0))
-    if not (by_run and free):
-        if by_run:  # coefficients by one-step errors for terms that were chosen, and fitted, by the free run
-            choice = choice.with_theta(choice.search(parts, free=False).theta)
-        _keep(fitting, parts, choice)
-        began = fitting.timed("terms", began)
-        if s.ne:
-            choice = add_noise_terms(s, choice, parts, part_of(noise, 0.0, 0.4))
-            choice = _search(parts, choice, fitting, part_of(noise, 0.4, 1.0))
-        began = fitting.timed("noise terms", began)
-        choice = _prune(s, parts, choice, fitting, pruning)
-        began = fitting.timed("pruning", began)
-    else:
-        began = fitting.timed("terms", began)
+    _keep(fitting, parts, choice)
+    began = fitting.timed("terms", began)
+    if s.ne:
+        choice = add_noise_terms(s, choice, parts, part_of(noise, 0.0, 0.4))
+        choice = _search(parts, choice, fitting, part_of(noise, 0.4, 1.0))
+    began = fitting.timed("noise terms", began)
+    choice = _prune(s, parts, choice, fitting, pruning)
+    began = fitting.timed("pruning", began)
     if free:
         choice = choice.without_noise()
         if np.isfinite(choice.cost(parts, free=True)):
@@ -157,7 +134,7 @@ def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick |
             fitting.status = "stalled"
             fitting.warnings.append(
                 "the simulation of the chosen terms diverges, so that their coefficients are those of the one-step "
-                "errors: choose terms by simulation (selection or pruning), or lower degree"
+                "errors: give pruning = simulation, or lower degree"
             )
         fitting.timed("simulation errors", began)
 

@@ -2,12 +2,9 @@
 
 Process terms come by orthogonal least squares; denominators with numerators from the equation multiplied out (thesis
 eq. 3.3), a prediction in place of y(t), whose noise would bias it (Billings and Zhu 1991); noise terms by extended
-least squares, process terms held (Billings 2013, sec. 3.5). By simulation, from a linear model, the candidate whose
-free-run slope explains most of the simulation error enters, all are searched again, useless terms go: the aim of
-Piroddi and Spinelli (2003), who run every candidate. Of a magnitude alone, such as a pulse counter's speed, the sign is
-not in the data, and a search from a wrong one ends in a wrong minimum: linear models of order three (a real pole, a
-pair, a delay) on a grid, gains fitted, the best refined. A term goes, others readjusted along the linearised problem
-(exact for NARX), if a criterion gains by predictions, or the free run does not pay: what predicts well may spoil a run.
+least squares, process terms held (Billings 2013, sec. 3.5). A term goes, others readjusted along the linearised
+problem (exact for NARX), if a criterion gains by predictions, or the free run does not pay: what predicts well may
+spoil a run.
 """
 
 from __future__ import annotations
@@ -24,9 +21,8 @@ from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import CRITERIA, information, penalty
 from ambid.nonlinear.fit import choice, read_settings, whole
-from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, problem_at
+from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
 from ambid.nonlinear.polynomial import (
-    OUTPUTS,
     Candidates,
     Factor,
     MatrixCandidates,
@@ -39,7 +35,6 @@ from ambid.nonlinear.polynomial import (
     select_terms,
 )
 from ambid.nonlinear.records import Parts
-from ambid.nonlinear.state_start import rank_grid
 
 _ENOUGH = 1e-3  # gain, in the errors' variance, that ends a search: a step of 0.03 standard deviations
 _NEARLY_ALL = 0.99  # of the output's energy
@@ -49,11 +44,9 @@ _LESS = 0.95  # part of the errors' variance that it must leave
 _ROUNDS = 12  # of extended least squares
 _USUAL_ROUNDS = 3.0  # about half of those that it takes
 _CHOOSING = 3  # rounds in which the choice of noise terms may still change
-_USUAL_PRUNED, _USUAL_TRIALS = 4.0, 8.0  # about half of the terms that are left out, of the trials by simulation
+_USUAL_PRUNED = 4.0  # about half of the terms that are left out
 _PRUNED = 10  # coefficients that are tried before it is said that none can go
-_ADDED = 4  # candidates that are tried by simulation before it is said that none pays
 _WORSE = 1.2  # times the errors' squares: beyond, leaving one out is far from what the linearised problem says
-_REFINED = 25  # models of the grid that are searched from
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,16 +69,14 @@ class NarmaxSettings:
     )
     kind: str = choice("polynomial or rational; polynomial", "polynomial", "rational")
     selection: str = choice(
-        "frols (by ratios), simulation (by simulation errors), all (every candidate), auto (frols; all if a plant "
-        "is sampled so fast that the ratios say little, and all predict better); auto",
-        *("auto", "frols", "simulation", "all"),
+        "frols (by ratios), all (every candidate), auto (frols; all if a plant is sampled so fast that the ratios "
+        "say little, and all predict better); auto",
+        *("auto", "frols", "all"),
     )
     focus: str = choice(
         "prediction or simulation: errors that are minimised in the end; prediction",
         *("prediction", "simulation"),
     )
-    output: str = choice("magnitude, if the sensor sees no sign; signed", *OUTPUTS)
-    symmetry: str = choice("odd for a plant with odd symmetry: terms of odd degree only; none", "none", "odd")
 
     @property
     def lag(self) -> int:
@@ -93,23 +84,9 @@ class NarmaxSettings:
         return max(self.ny, self.nk + self.nu - 1 if self.nu else 0, self.ne)
 
 
-_WITH_MAGNITUDE: Mapping[str, object] = {
-    "selection": "simulation",
-    "focus": "simulation",
-    "kind": "polynomial",
-    "pruning": "simulation",
-    "ne": 0,
-}
-
-
 def narmax_settings(settings: Mapping[str, object], *, n_inputs: int) -> NarmaxSettings:
     """Check settings and complete them; without inputs there are no lags of them."""
     s = read_settings(NarmaxSettings, "narmax", settings)
-    if s.output != "signed":  # a sign that is not measured is found by simulation
-        for name, value in _WITH_MAGNITUDE.items():
-            if settings.get(name, value) != value:
-                raise EstimationError(f"narmax: output = {s.output} needs {name} = {value}; it is {settings[name]!r}")
-        s = replace(s, **_WITH_MAGNITUDE)  # type: ignore[arg-type]
     if not n_inputs:
         s = replace(s, nu=0, nk=1)
     if not s.ny and not s.nu:
@@ -213,7 +190,7 @@ def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Choice:
 def process_candidates(s: NarmaxSettings, n_outputs: int, n_inputs: int) -> tuple[Term, ...]:
     """Return all products of lagged outputs and inputs that the settings allow."""
     factors = lagged(n_outputs, n_inputs, ny=s.ny, nu=s.nu, nk=s.nk)
-    return products(factors, s.degree, constant=bool(s.constant), odd=s.symmetry == "odd")
+    return products(factors, s.degree, constant=bool(s.constant))
 
 
 def is_sampled_fast(model: Choice) -> bool:
@@ -232,7 +209,7 @@ def rational_terms(s: NarmaxSettings, polynomial: Choice, parts: Parts, tick: Ti
     """Choose numerators and denominators together; the predictions of a `polynomial` model begin the iteration."""
     p, m = parts[0][0].shape[1], parts[0][1].shape[1]
     up = process_candidates(s, p, m)
-    down = process_candidates(replace(s, constant=0, symmetry="none"), p, m)
+    down = process_candidates(replace(s, constant=0), p, m)
     both = (*up, *down)
     P, D = (candidates(x, parts, s.lag).columns(range(len(x))) for x in (up, down))
     owned: list[tuple[int, int, Term]] = []
@@ -369,26 +346,18 @@ def prune_by_prediction(model: Choice, parts: Parts, weight: Array, criterion: s
 
 
 def prune_by_simulation(
-    model: Choice, parts: Parts, value: Callable[[Choice], float], tick: Tick | None = None, *, anew: bool = False
+    model: Choice, parts: Parts, value: Callable[[Choice], float], tick: Tick | None = None
 ) -> Choice:
-    """Leave out process terms while `value`, an information criterion of simulation errors, falls; with `again` only
-    the least significant at a time, the rest searched again.
-    """
+    """Leave out process terms while `value`, an information criterion of simulation errors, falls."""
     now, before = value(model), model.theta.size
-    while model.theta.size > max(model.function.n_outputs, 2 * anew) and np.isfinite(now):
+    while model.theta.size > model.function.n_outputs and np.isfinite(now):
         if tick is not None:
             tick("simulation-error pruning", guessed(before - model.theta.size, _USUAL_PRUNED))
-        R = model.problem(parts, free=anew).triangle(model.theta)
+        R = model.problem(parts).triangle(model.theta)
         if not np.all(np.isfinite(R)):
             break
-        loss, inverse = _find_losses(R, model.theta)
-        may = np.flatnonzero(_may_go(model, noise=False))
-        if anew:
-            may = may[np.argmin(loss[may], keepdims=True)]
-        if anew:
-            trials = [_simulated(model.without(int(k), np.delete(model.theta, k)), parts) for k in may]
-        else:
-            trials = [_readjust(model, inverse, int(k)) for k in may]
+        _, inverse = _find_losses(R, model.theta)
+        trials = [_readjust(model, inverse, int(k)) for k in np.flatnonzero(_may_go(model, noise=False))]
         values = [value(x) for x in trials]
         if not values or not min(values) < now:
             break
@@ -416,81 +385,3 @@ def _may_go(model: Choice, *, noise: bool) -> np.ndarray:
     function = model.function
     alone = np.array([not below and len(function.numerators[o]) == 1 for o, below, _ in function.owned])
     return np.asarray(~alone & (noise | ~function.noisy))
-
-
-# --- by simulation ----------------------------------------------------------------------------------------------------
-
-
-def choose_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep: Callable[[Choice], None]) -> Choice:
-    """Choose process terms by the free run's error (`keep` gets each better model), one-step coefficients where none is
-    finite.
-    """
-    if parts[0][0].shape[1] > 1:
-        raise EstimationError("narmax: selection = simulation is for one output. Use frols, and pruning = simulation")
-    terms, n = process_candidates(s, 1, parts[0][1].shape[1]), samples(parts, s.lag)
-    most = min(s.terms, max(n // 5, 1), len(terms))
-    first, trials, tried = part_of(tick, 0.0, 0.3), part_of(tick, 0.3, 1.0), 0
-    if s.output == "signed":
-        linear = replace(s, degree=1, selection="all", ne=0)
-        model = _simulated(process_terms(linear, parts, None), parts)
-    else:
-        model = _start_of_magnitude(s, parts, first)
-    model = replace(model, n_candidates=len(terms))
-
-    def value(x: Choice) -> float:
-        return x.value(s.criterion, parts, n, free=True)
-
-    now = value(model)
-    if not np.isfinite(now):
-        return model
-    keep(model)
-    while model.theta.size < most:
-        better = None
-        for term in _promising(model, terms, parts)[:_ADDED]:
-            if trials is not None:
-                trials("choice of terms by simulation", guessed(tried, _USUAL_TRIALS))
-            tried += 1
-            wider = model.with_numerators([(*model.function.numerators[0], term)], [np.append(model.theta, 0.0)])
-            trial = prune_by_simulation(_simulated(wider, parts), parts, value, anew=True)
-            if value(trial) < now:
-                better = trial
-                break
-        if better is None:
-            break
-        model, now = better, value(better)
-        keep(model)
-    return model
-
-
-def _simulated(model: Choice, parts: Parts) -> Choice:
-    return model.with_theta(model.search(parts, free=True, most=25).theta)
-
-
-def _promising(model: Choice, terms: tuple[Term, ...], parts: Parts) -> list[Term]:
-    """Candidates outside the model, the largest error reduction ratio beside its terms first."""
-    inside = model.function.numerators[0]
-    outside = [x for x in terms if x not in set(inside)]
-    wide = model.with_numerators([(*inside, *outside)], [np.append(model.theta, np.zeros(len(outside)))])
-    R, k = wide.problem(parts, free=True).triangle(wide.theta), len(inside)
-    if not outside or not np.all(np.isfinite(R)):
-        return []
-    ratio = column_gains(R, np.arange(wide.theta.size) < k)
-    return [outside[int(i)] for i in np.argsort(-ratio, kind="stable") if ratio[i] > 0]
-
-
-def _start_of_magnitude(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Choice:
-    """The best linear model of the magnitude, fitted to the free run."""
-    order, delays = min(s.ny, 3), range(max(s.nk, 1), s.nk + s.nu)
-    terms = tuple((f,) for f in lagged(1, 1, ny=order, nu=len(delays), nk=delays.start))
-    function = PolynomialFunction(numerators=(terms,), denominators=((),), m=1, folded=True)
-    best, least = None, np.inf
-    for k, (A, _, d, gain) in enumerate(rank_grid(parts, order, delays)[:_REFINED]):
-        if tick is not None:
-            tick("sign of the output", k / _REFINED)
-        theta = np.concatenate([-A[1:], gain * (np.array(delays) == d)])
-        trial = Choice(function=function, theta=theta)
-        ended = trial.search(parts, free=True, most=30)
-        if best is None or ended.cost < least:
-            best, least = trial.with_theta(ended.theta), ended.cost
-    assert best is not None
-    return best

@@ -2,8 +2,6 @@
 
 Delay -> subspace start -> the thesis's training and Gauss-Newton (learning curves) -> Levenberg-Marquardt on simulation
 errors -> hidden layer (option) -> predictor gain for coloured errors -> global search if all failed -> covariance.
-Behind a sensor without sign (output=magnitude), such as a pulse counter: a grid of poles -> states by Bayes' criterion
--> odd hidden units by how the free run goes on behind parts of the records.
 """
 
 from __future__ import annotations
@@ -18,14 +16,13 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions, silent
 from ambid.nonlinear.fit import NonlinearFit, Settings, choice, read_settings, whole
-from ambid.nonlinear.records import Scaled, scaled_records
+from ambid.nonlinear.records import scaled_records
 from ambid.nonlinear.state_start import (
     LARGEST,
     NO_START,
     SHORT,
     find_delay,
     first_network,
-    grid_starts,
     guess_delay,
     matrices_json,
     search_start,
@@ -34,7 +31,6 @@ from ambid.nonlinear.state_start import (
 from ambid.nonlinear.state_training import (
     Fitting,
     State,
-    Training,
     add_gain,
     add_units,
     finish,
@@ -44,27 +40,16 @@ from ambid.nonlinear.state_training import (
     train_each,
 )  # fmt: skip
 
-_SIGNED: Mapping[str, object] = {"neurons": 0, "starts": 3, "evaluations": 2000}
-_MAGNITUDE: Mapping[str, object] = {
-    "form": "free", "noise": "output", "delay": 0, "descent": 0, "evaluations": 0, "uncertainty": "laplace",
-}  # fmt: skip
+_USUAL: Mapping[str, object] = {"neurons": 0, "starts": 3, "evaluations": 2000}
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
 _LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
 _BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
 _MORE = 2  # states beyond the outputs, for the delay
 _LARGEST = 5  # states beyond the outputs that are tried
+_PATIENCE = 2  # states beyond the best, after which no more are tried
 _DELAY, _TRAINING, _RESCUE, _AGAIN, _SPREAD = (  # shares of the time: rescues are rare
     (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.0),
 )  # fmt: skip
-
-MOST_STATES = 4  # behind a sensor without sign
-_MOST_UNITS = 3
-_REFINED = 8  # linear starts that are searched from
-_CLEAR = 10.0  # of Bayes' criterion, which a larger model has to gain (Kass and Raftery 1995): errors are not white
-_FOLDS = (0.5, 0.625, 0.75)  # of each record are trained on in the choice of units ..
-_AHEAD = 0.25  # .. and so much behind is run on
-_LESS = 0.95  # part of the held-out error to which further units have to bring it
-_LAST = 10  # times as many iterations for the best start
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,14 +64,8 @@ class NnSettings:
     delay: int | None = whole(
         "delay of the inputs in samples; auto (0 to 20, by the errors of short trainings)", 0, 1000
     )
-    output: str = choice(
-        "magnitude if the sensor sees no sign (free, no gain, up to four states, odd units); signed",
-        *("signed", "magnitude"),
-    )
-    neurons: int | None = whole(
-        "hidden units of G(x, u); 0; with output=magnitude chosen by simulation beyond the training", 0, 40
-    )
-    starts: int | None = whole("random starts of G; 3, with output=magnitude 20", 1, 20)
+    neurons: int | None = whole("hidden units of G(x, u); 0", 0, 40)
+    starts: int | None = whole("random starts of G; 3", 1, 20)
     noise: str = choice(
         "output, innovations (predictor gain), auto (gain where errors are not white); auto",
         *("auto", "output", "innovations"),
@@ -122,11 +101,8 @@ def nn(
     right errors.
     """
     chosen = {k: v for k, v in asdict(read_settings(NnSettings, "nn", settings)).items() if v is not None}
-    unsigned = chosen["output"] == "magnitude"
-    if unsigned:
-        _check_magnitude(records, {k: v for k, v in chosen.items() if k in settings})
-    s: dict[str, Any] = {"starts": 20, **chosen, **_MAGNITUDE} if unsigned else {**_SIGNED, **chosen}
-    data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)), levels="zero" if unsigned else "mean")
+    s: dict[str, Any] = {**_USUAL, **chosen}
+    data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)))
     requested, first = str(s["form"]), records[0]
     units = [first.units.get(x) for x in first.outputs]
     fits = (
@@ -143,16 +119,13 @@ def nn(
     fitting = Fitting(structure="nn", records=records, settings=s, seed=seed, whole=data, data=data)
     reason = NO_START
     try:
-        if unsigned:
-            _train_magnitude(fitting, tick)
-        else:
-            reason = _start(fitting, tick)
-            if not reason:
-                _train_all(fitting, part_of(tick, *_TRAINING))
-                if linear is not None and s["form"] == "one-axis" and not s["neurons"]:
-                    _train_again(fitting, linear)
-            reason = _rescue(fitting, tick, reason, requested="evaluations" in settings)
-            _caution(fitting)
+        reason = _start(fitting, tick)
+        if not reason:
+            _train_all(fitting, part_of(tick, *_TRAINING))
+            if linear is not None and s["form"] == "one-axis" and not s["neurons"]:
+                _train_again(fitting, linear)
+        reason = _rescue(fitting, tick, reason, requested="evaluations" in settings)
+        _caution(fitting)
     except KeyboardInterrupt:
         fitting.interrupt()
         if reason in ("", NO_START):
@@ -161,7 +134,7 @@ def nn(
         reason = f"the training failed: {error}"
         fitting.state = None
     state = fitting.state
-    if state is not None and not unsigned and s["form"] == "free":
+    if state is not None and s["form"] == "free":
         m = state.layout.matrices(state.theta)
         fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B, sampled=True)
     return finish(fitting, reason, part_of(tick, *_SPREAD))
@@ -236,9 +209,8 @@ def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> 
     assert fitting.state is not None
     if fitting.counts_states:
         p = data.n_outputs
-        starts = {n: [first_network(data, fitting.dt, n)] for n in range(p, p + _LARGEST + 1)}
-        best = _choose_states(fitting, starts, choice, patience=2, stage="choice of states", iterations=6)
-        fitting.state = best.state if best is not None else fitting.state
+        starts = {n: first_network(data, fitting.dt, n) for n in range(p, p + _LARGEST + 1)}
+        fitting.state = _choose_states(fitting, starts, choice) or fitting.state
     first = fitting.state
     if s["descent"] and descent:
         with fitting.stage("one-step training"):
@@ -250,7 +222,8 @@ def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> 
             train(bare, data, stage="simulation errors", iterations=most, tick=physics, fitting=fitting)
         if s["neurons"]:
             neurons = int(s["neurons"])
-            trained = _train_units(s, fitting.state, data, neurons, [fitting.seed], hidden, fitting=fitting)
+            begun = [add_units(fitting.state, neurons, [fitting.seed, k]) for k in range(int(s["starts"]))]
+            trained = train_each(begun, data, hidden, stage="hidden layer", iterations=most, fitting=fitting)
             fitting.rivals = [x.state for x in trained]
         _train_gain(fitting, first, gain)
 
@@ -287,123 +260,26 @@ def _train_gain(fitting: Fitting, first: State, tick: Tick | None) -> None:
     train(wide, data, stage="prediction errors", iterations=most, tick=tick, fitting=fitting)
 
 
-def _train_units(
-    s: Mapping[str, Any], base: State, data: Scaled, neurons: int, seed: list[int], tick: Tick | None, **how: Any
-) -> list[Training]:
-    """Several random starts of a hidden layer, the best first; units have no effect at first."""
-    begun = [add_units(base, neurons, [*seed, k]) for k in range(int(s["starts"]))]
-    return train_each(begun, data, tick, stage="hidden layer", iterations=int(s["iterations"]), **how)
-
-
-def _choose_states(
-    fitting: Fitting,
-    starts: Mapping[int, Sequence[State | str]],
-    tick: Tick | None,
-    *,
-    patience: int,
-    clear: float = 0.0,
-    **how: Any,
-) -> Training | None:
-    """The network of the number of states best by Bayes' criterion, a larger one if `clear` of it; `starts`: by that
-    number.
-    """
-    best: Training | None = None
+def _choose_states(fitting: Fitting, starts: Mapping[int, State | str], tick: Tick | None) -> State | None:
+    """The network of the number of states best by Bayes' criterion; `starts`: by that number."""
+    best: State | None = None
     values: list[dict[str, Any]] = []
     for (n, begun), own in zip(starts.items(), portions(tick, [1.0] * len(starts)), strict=True):
-        trained = train_each([x for x in begun if isinstance(x, State)], fitting.data, own, **how)
-        if not trained:
+        trained = (
+            train(begun, fitting.data, stage="choice of states", iterations=6, tick=own)
+            if isinstance(begun, State)
+            else None
+        )
+        if trained is None:
             continue
-        at = trained[0].state
+        at = trained.state
         values.append({"states": n, "bic": at.bic})
-        if best is None or at.bic < best.state.bic - clear:
-            best = trained[0]
-        elif n >= best.state.layout.n + patience:
+        if best is None or at.bic < best.bic:
+            best = at
+        elif n >= best.layout.n + _PATIENCE:
             break
     fitting.details["tried_states"] = values
     return best
-
-
-# --- a sensor without sign -------------------------------------------------------------------------------------------
-
-
-def _check_magnitude(records: Sequence[IOData], settings: Mapping[str, object]) -> None:
-    names = ("output", "starts", "iterations", "states", "neurons")
-    for name, value in settings.items():
-        if name not in names and value not in ("auto", _MAGNITUDE[name]):
-            raise EstimationError(
-                f"nn: {name} = {value!r} does not apply with output = magnitude; known there: {', '.join(names)}. "
-                "Omit it"
-            )
-    states = settings.get("states")
-    if isinstance(states, int) and states > MOST_STATES:
-        raise EstimationError(f"nn: states = {states} with output = magnitude; at most {MOST_STATES}. Lower it")
-    for r, x in enumerate(records):
-        if x.n_outputs != 1 or not x.n_inputs:
-            raise EstimationError("nn: output = magnitude is for one output and at least one input. Choose them")
-        if np.min(x.y) < 0:
-            raise EstimationError(
-                f"nn: output {x.outputs[0]!r} of record {r + 1} is negative at sample {int(np.argmin(x.y))}; a "
-                "magnitude is not. Use output = signed"
-            )
-
-
-def _train_magnitude(fitting: Fitting, tick: Tick | None) -> None:
-    """Train a network behind a sensor without sign: number of states, number of units, training on all."""
-    s, data = fitting.settings, fitting.data
-    most, runs = int(s["iterations"]), int(s["starts"])
-    tried = range(1, MOST_STATES + 1) if "states" not in s else (int(s["states"]),)
-    units = range(_MOST_UNITS + 1) if "neurons" not in s else (int(s["neurons"]),)
-    linear, choice, last = portions(tick, (4.0, len(_FOLDS) * sum(units) * runs * (len(units) > 1), units[-1] * runs))
-    with fitting.stage("linear"):
-        starts = {n: [State.of(*x, data) for x in grid_starts(data.parts, n, _REFINED, fitting.dt)] for n in tried}
-        base = _choose_states(
-            fitting, starts, linear, patience=MOST_STATES, clear=_CLEAR, stage="linear part", iterations=most
-        )
-        if base is None:
-            return
-        fitting.take(base)
-    with fitting.stage("choice of units"):
-        neurons = _choose_units(fitting, base.state, choice) if len(units) > 1 else units[0]
-    with fitting.stage("training"):
-        trained = _train_units(s, base.state, data, neurons, [fitting.seed, neurons], last) if neurons else []
-        if trained:
-            train(trained[0].state, data, stage="hidden layer", iterations=_LAST * most, fitting=fitting)
-    size = float(np.std(np.concatenate([y for y, _ in data.parts])))
-    fitting.curves = [replace(c, training=c.training / max(size, 1e-300)) for c in fitting.curves]
-
-
-def _choose_units(fitting: Fitting, linear: State, tick: Tick | None) -> int:
-    """Number of hidden units by the runs that go on behind the parts of the records that are trained on."""
-    s, data, squares = fitting.settings, fitting.data, np.zeros(_MOST_UNITS + 1)
-    parts = iter(portions(tick, [k for _ in _FOLDS for k in range(1, _MOST_UNITS + 1)]))
-    for share in _FOLDS:
-        cut = [round(share * y.shape[0]) for y, _ in data.parts]
-        fewer = _first_samples(data, cut)
-        refitted = train(linear, fewer, stage="linear part", iterations=int(s["iterations"]))
-        base = linear if refitted is None else refitted.state
-        squares[0] += _error_ahead(base, data, cut) ** 2
-        for neurons in range(1, _MOST_UNITS + 1):
-            trained = _train_units(s, base, fewer, neurons, [fitting.seed, neurons], next(parts))
-            squares[neurons] += _error_ahead(trained[0].state, data, cut) ** 2 if trained else np.inf
-    errors = np.sqrt(squares / len(_FOLDS))
-    fitting.details["held_out"] = [{"neurons": k, "error": float(e)} for k, e in enumerate(errors) if np.isfinite(e)]
-    chosen = 0
-    for k in range(1, errors.size):
-        if errors[k] < _LESS * errors[chosen]:
-            chosen = k
-    return chosen
-
-
-def _first_samples(data: Scaled, cut: Sequence[int]) -> Scaled:
-    return replace(data, parts=tuple((y[:k], u[:k]) for (y, u), k in zip(data.parts, cut, strict=True)))
-
-
-def _error_ahead(at: State, data: Scaled, cut: list[int]) -> float:
-    """Error of the run that goes on behind what was trained on, scaled."""
-    longer = _first_samples(data, [k + round(_AHEAD * y.shape[0]) for (y, _), k in zip(data.parts, cut, strict=True)])
-    errors = at.problem(longer).errors(at.vector)[1]
-    size = float(np.sqrt(np.mean(np.concatenate([e[k:] for e, k in zip(errors, cut, strict=True)]) ** 2)))
-    return size if np.isfinite(size) else np.inf
 
 
 # --- rescue ----------------------------------------------------------------------------------------------------------

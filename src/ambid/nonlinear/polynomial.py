@@ -21,7 +21,6 @@ from ambid.estimation.uncertainty import EXACT, information, penalty
 from ambid.nonlinear.lagged import Block, LaggedFunction, Mask, Regressors, Terms, channel_names
 
 MOST_CANDIDATES = 20_000
-OUTPUTS = ("signed", "magnitude")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -45,10 +44,10 @@ def lagged(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int 
     return tuple(out)
 
 
-def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True, odd: bool = False) -> tuple[Term, ...]:
+def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True) -> tuple[Term, ...]:
     """Return all products of the factors up to a degree, by degree: the candidates of a polynomial (thesis eq. 3.4)."""
-    out: list[Term] = [()] if constant and not odd else []
-    for d in range(1, degree + 1, 2 if odd else 1):
+    out: list[Term] = [()] if constant else []
+    for d in range(1, degree + 1):
         for term in combinations_with_replacement(factors, d):
             out.append(tuple(sorted(term)))
             if len(out) > MOST_CANDIDATES:
@@ -136,7 +135,6 @@ class PolynomialFunction(LaggedFunction):
     numerators: tuple[tuple[Term, ...], ...]  # by output
     denominators: tuple[tuple[Term, ...], ...]
     m: int  # inputs
-    folded: bool = False
 
     @cached_property
     def owned(self) -> tuple[tuple[int, int, Term], ...]:
@@ -188,21 +186,6 @@ class PolynomialFunction(LaggedFunction):
         names = [(o, below, term_name(x, p, self.m)) for o, below, x in self.owned]
         return tuple((f"{channel[o]}: " if p > 1 else "") + (f"1/({x})" if below else x) for o, below, x in names)
 
-    @cached_property
-    def _linear(self) -> Array:
-        """Which terms are single signals, a row for each column of the signals."""
-        out = np.zeros((2 * len(self.numerators) + self.m, len(self.owned)))
-        for k, (_, below, x) in enumerate(self.owned):
-            if len(x) == 1 and not below:
-                out[column_of(x[0], len(self.numerators), self.m), k] = 1.0
-        return out
-
-    def first_sign(self, theta: Array, z: Array) -> float:
-        """As `LaggedFunction.first_sign`: where the linear part is driven to at first."""
-        gains = self._linear @ theta
-        driven = gains[1 : 1 + self.m] @ np.mean(z[: self.lag, 1 : 1 + self.m], axis=0)
-        return -1.0 if driven * (1.0 - gains[0]) < 0 else 1.0
-
     def unit(self, y_scale: Array, u_scale: Array) -> Array:
         """As `LaggedFunction.unit`: coefficients are in SI."""
         return unit_of(self.owned, y_scale, u_scale)
@@ -211,7 +194,6 @@ class PolynomialFunction(LaggedFunction):
         """As `LaggedFunction.as_json`."""
         return {
             "n_inputs": self.m,
-            "output": OUTPUTS[self.folded],
             "numerators": terms_to_json(self.numerators),
             "denominators": terms_to_json(self.denominators),
         }
@@ -221,9 +203,9 @@ class PolynomialFunction(LaggedFunction):
         """Read it back."""
         p, m = len(document["numerators"]), int(document["n_inputs"])
         num, den = (terms_from_json(document[k], p, m) for k in ("numerators", "denominators"))
-        if document["output"] not in OUTPUTS:
-            raise ValueError(f"output is none of {', '.join(OUTPUTS)}")
-        return cls(numerators=num, denominators=den, m=m, folded=document["output"] == "magnitude")
+        if document.get("output", "signed") != "signed":
+            raise ValueError("it is of a sensor without sign")
+        return cls(numerators=num, denominators=den, m=m)
 
 
 _BLOCK = 4096  # rows at a time: a block of some hundred candidates stays in the cache of the second level

@@ -187,7 +187,7 @@ def scaled_records(
     structure: str, records: Sequence[IOData], *, lag: int, levels: str = "mean", fewest: int = _FEWEST
 ) -> Scaled:
     """Check that records belong together, for `structure` with `lag` past samples and `fewest` more, and scale
-    deviations from `levels`: means, zero, or (auto) means where signals stand far from zero. Levels change what
+    deviations from `levels`: means, or (auto) means where signals stand far from zero. Levels change what
     polynomial terms mean.
     """
     if not records:
@@ -227,7 +227,7 @@ def _group(
                 f"{structure}: {channel!r} is constant at {whole[0, k]:g} and carries no information. Excite it, "
                 "or omit it"
             )
-    off = np.abs(mean) > _FAR * sd if levels == "auto" else np.full(mean.shape, levels == "mean")
+    off = np.abs(mean) > _FAR * sd if levels == "auto" else np.ones(mean.shape, dtype=np.bool_)
     level, scale = np.where(off, mean, 0.0), np.where(off, sd, np.hypot(mean, sd))
     return [(x - level) / scale for x in values], level, scale
 

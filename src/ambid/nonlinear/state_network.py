@@ -3,16 +3,15 @@
 x+ = A x + B u + c + K e + G f(x, u), y = x[heads] + e (thesis eq. 5.1, fig. 5.9). ``one-axis``: weights are entries of
 the continuous A and B of thesis eq. 4.8 (position, velocity, current), sampled by the matrix exponential. ``free``:
 those sampled; an unmeasured state is the scaled difference before it, x_j+ = x_j + step x_(j+1) + .., which makes them
-unique. Behind a sensor without sign the output is |x1| behind a low pass, and the network odd: nothing tells directions
-apart.
+unique.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import fields_json, read_as
 from ambid.estimation.linear import triangle_of
-from ambid.estimation.search import search
 from ambid.nonlinear.records import Parts, ScaledModel, read_numbers, scaled, with_head
 
 Table = NDArray[np.int64]
@@ -30,7 +28,6 @@ ONE_AXIS = ((1, 0), (1, 2), (2, 1), (2, 2), (2, 3), (1, 4), (2, 4))
 """Free weights of thesis eq. 4.8 in [A | B | c]: a21, a23, a32, a33, b3, and constants of force and voltage."""
 
 _ROWS = 2048  # that are joined and reduced at once: they stay in the cache
-_SIGNS = (0.0, 1.0, -1.0)  # of the state that a search behind a sensor without sign begins at, in sizes of the output
 
 # --- weights and matrices --------------------------------------------------------------------------------------------
 
@@ -45,7 +42,6 @@ class Matrices:
     W1: Array
     b1: Array
     W2: Array
-    rho: float  # pole of a sensor without sign
 
     @property
     def A(self) -> Array:
@@ -70,25 +66,25 @@ class Matrices:
         return replace(self, M=M, D=D)
 
     def run(self, y: Array, u: Array, x0: Array) -> tuple[Array, Array]:
-        """Return states (n_samples + 1, width) from `x0` and innovations (n_samples, p), NaN from a divergence on;
+        """Return states (n_samples + 1, n) from `x0` and innovations (n_samples, p), NaN from a divergence on;
         `u`'s last column is ones.
         """
         from ambid.nonlinear.kernels import run_states
 
         X, E = np.empty((u.shape[0] + 1, x0.size)), np.empty((u.shape[0], self.heads.size))
         X[0] = x0
-        run_states(self.M, self.heads, self.W1, self.b1, self.W2, self.rho, u, y, X, E)
+        run_states(self.M, self.heads, self.W1, self.b1, self.W2, u, y, X, E)
         return X, E
 
     def slopes(self, u: Array, X: Array, E: Array, s: Array) -> Array:
-        """Return the predictions' slopes (n_samples, p, n_columns) along `run`; `s` (width, n_columns) goes from the
+        """Return the predictions' slopes (n_samples, p, n_columns) along `run`; `s` (n, n_columns) goes from the
         first state's to the last's.
         """
         from ambid.nonlinear.kernels import slope_states
 
         out = np.empty((u.shape[0], self.heads.size, s.shape[1]))
         changed = np.any(self.D != 0.0, axis=2).astype(np.int64)
-        slope_states(self.M, self.heads, self.W1, self.b1, self.W2, self.rho, self.D, changed, u, X, E, s, out)
+        slope_states(self.M, self.heads, self.W1, self.b1, self.W2, self.D, changed, u, X, E, s, out)
         return out
 
 
@@ -108,20 +104,16 @@ class Layout:
     rows: tuple[int, ...]  # states that G acts on
     gain: bool = False  # whether K is estimated; else it is 0
     neurons: int = 0
-    sensor: bool = False  # whether the output is |x1| behind a low pass, which is the last state
 
     @classmethod
     def free(
         cls, dt: float, chains: tuple[int, ...], steps: Sequence[float], scale: Sequence[float], **more: Any
     ) -> Layout:
-        """Return the form ``free``, of which `chains` counts the states of each output; a sensor has no constant."""
+        """Return the form ``free``, of which `chains` counts the states of each output."""
         n = sum(chains)
         m, heads, ends = len(scale) - n, np.cumsum((0, *chains))[:-1].tolist(), (np.cumsum(chains) - 1).tolist()
         entries = [(r, c) for r in ends for c in range(n)] + [(r, n + c) for r in range(n) for c in range(m)]
-        if more.get("sensor"):
-            heads = [n]
-        else:
-            entries += [(r, n + m) for r in heads]
+        entries += [(r, n + m) for r in heads]
         return cls(
             form="free", dt=dt, n_inputs=m, heads=tuple(heads), steps=tuple(steps), entries=tuple(entries),
             scale=tuple(scale), rates=(1.0,) * n, rows=tuple(range(n)), **more,
@@ -129,7 +121,7 @@ class Layout:
 
     @property
     def n(self) -> int:
-        """Number of states, without that of a sensor."""
+        """Number of states."""
         return len(self.scale) - self.n_inputs
 
     @property
@@ -138,30 +130,19 @@ class Layout:
         return len(self.heads)
 
     @property
-    def width(self) -> int:
-        """Number of states with that of a sensor."""
-        return self.n + self.sensor
-
-    @property
     def n_directions(self) -> int:
-        """Weights that are entries of the matrices, or the pole of a sensor."""
-        return len(self.entries) + self.gain * self.n * self.p + self.sensor
+        """Weights that are entries of the matrices."""
+        return len(self.entries) + self.gain * self.n * self.p
 
     @property
     def hidden_sizes(self) -> tuple[int, int, int]:
-        """Numbers of weights in W1, b1, W2. Units behind a sensor without sign have no bias: they are odd."""
-        biases = 0 if self.sensor else self.neurons
-        return self.neurons * (self.n + self.n_inputs), biases, self.neurons * len(self.rows)
+        """Numbers of weights in W1, b1, W2."""
+        return self.neurons * (self.n + self.n_inputs), self.neurons, self.neurons * len(self.rows)
 
     @property
     def n_theta(self) -> int:
         """All weights."""
         return self.n_directions + sum(self.hidden_sizes)
-
-    @property
-    def anchored(self) -> bool:
-        """Whether hidden units have neither value nor slope at the operating point: A and B are the slope there."""
-        return not self.sensor
 
     @cached_property
     def unit(self) -> Array:
@@ -181,12 +162,9 @@ class Layout:
             out.append(f"a{r + 1}{c + 1}" if c < n else f"c{r + 1}" if c == n + m else of_input)
         if self.gain:
             out += [f"k{i + 1}{j + 1}" for i in range(n) for j in range(self.p)]
-        if self.sensor:
-            out.append("sensor pole")
         z = [f"x{j + 1}" for j in range(n)] + [f"u{j + 1}" for j in range(m)]
         out += [f"unit {k + 1}: {x}" for k in units for x in z]
-        if not self.sensor:
-            out += [f"unit {k + 1}: 1" for k in units]
+        out += [f"unit {k + 1}: 1" for k in units]
         return (*out, *(f"x{r + 1}: unit {k + 1}" for r in self.rows for k in units))
 
     def widen(self, theta: Array, **changes: Any) -> tuple[Layout, Array]:
@@ -219,8 +197,7 @@ class Layout:
         W1, b1, W2 = np.split(theta[P1:], np.cumsum(self.hidden_sizes)[:2])
         return Matrices(
             heads=np.array(self.heads, dtype=np.int64), M=M, D=D, W1=W1.reshape(h, n + self.n_inputs).copy(),
-            b1=b1.copy() if b1.size else np.zeros(h), W2=W2.reshape(q, h).copy(),
-            rho=float(theta[k]) if self.sensor else 0.0,
+            b1=b1.copy(), W2=W2.reshape(q, h).copy(),
         )  # fmt: skip
 
     def weights(self, theta: Array) -> Array:
@@ -271,14 +248,13 @@ class StateProblem:
     parts: Parts  # inputs with a last column of ones
     weight: Array  # (n_outputs, n_outputs), errors times it have unit covariance
     prior: float | None = None  # deviation of the hidden layer's weights before the data
-    held: slice = field(default_factory=lambda: slice(0, 0))  # weights that are not searched for
     # modulus that no pole of the linear predictor A - K C may reach. Without it the search creeps towards a predictor
     # that runs away from its first state on: on a plant without process noise that fits the sample a little better.
     farthest: float = np.inf
 
     def split(self, v: Array) -> tuple[Array, Array]:
-        """Return weights (n_theta,) and first states (n_records, width)."""
-        return v[: self.layout.n_theta], v[self.layout.n_theta :].reshape(len(self.parts), self.layout.width)
+        """Return weights (n_theta,) and first states (n_records, n)."""
+        return v[: self.layout.n_theta], v[self.layout.n_theta :].reshape(len(self.parts), self.layout.n)
 
     def errors(self, v: Array) -> tuple[list[Array], list[Array]]:
         """Return states and errors of every record."""
@@ -316,9 +292,7 @@ class StateProblem:
                 rows.append(
                     self._widen(triangle_of([both[:, a : a + _ROWS].reshape(-1, width) for a in some]), k, theta.size)
                 )
-        whole = np.concatenate(rows)
-        whole[:, self.held] = 0.0
-        return triangle_of([whole])
+        return triangle_of([np.concatenate(rows)])
 
     def sample_rows(self, v: Array) -> list[Array]:
         """Return slopes and errors of every sample, joined to ones of unit variance: (n_samples, p, v.size + 1)."""
@@ -330,13 +304,13 @@ class StateProblem:
         layout, m = self.layout, self.layout.matrices(theta)
         for (y, u), x in zip(self.parts, x0, strict=True):
             X, E = m.run(y, u, x)
-            s = np.hstack([np.zeros((layout.width, theta.size)), np.eye(layout.width)])
+            s = np.hstack([np.zeros((layout.n, theta.size)), np.eye(layout.n)])
             both = np.concatenate([m.slopes(u, X, E, s), E[:, :, None]], axis=2)
             yield np.tensordot(self.weight, both, axes=(0, 1))
 
     def _widen(self, rows: Array, k: int, size: int) -> Array:
         """Rows of record `k` over all unknown: other records' first states do not enter."""
-        P, n = self.layout.n_theta, self.layout.width
+        P, n = self.layout.n_theta, self.layout.n
         wide = np.zeros((*rows.shape[:-1], size + 1))
         wide[..., :P], wide[..., P + k * n : P + (k + 1) * n] = rows[..., :P], rows[..., P:-1]
         wide[..., -1] = rows[..., -1]
@@ -349,18 +323,12 @@ class StateProblem:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateNetwork(ScaledModel):
     """A trained network (implements `NonlinearModel`), entries of A and B in SI, else scaled; cloud of states and
-    inputs. The first state fits the first `lag` samples best, without G and K. Behind a sensor without sign a
-    prediction is the free run from the best first state, searched from rest and both signs: what is measured does not
-    correct it.
+    inputs. The first state fits the first `lag` samples best, without G and K.
     """
 
+    kind: ClassVar[str] = "nn"
     layout: Layout
     delay: int = 0  # samples by which inputs act late
-
-    @property
-    def kind(self) -> str:
-        """``nn``, or ``nn-magnitude`` behind a sensor without sign."""
-        return "nn-magnitude" if self.layout.sensor else "nn"
 
     @property
     def dt(self) -> float:
@@ -375,7 +343,7 @@ class StateNetwork(ScaledModel):
     @property
     def _head(self) -> int:
         """Samples that the first state is fitted to."""
-        return 5 * self.layout.width if self.layout.sensor else max(3 * self.layout.n, 5)
+        return max(3 * self.layout.n, 5)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -413,10 +381,10 @@ class StateNetwork(ScaledModel):
         return out
 
     def states(self, u: Array, y: Array) -> Array:
-        """Return predicted scaled states (n_samples, width): NaN in the first `delay` rows, from a divergence on."""
+        """Return predicted scaled states (n_samples, n): NaN in the first `delay` rows, from a divergence on."""
         ys, us = self._late(u, y)
         x0, _ = self._first_state(ys, us, derive=False)
-        out = np.full((np.asarray(u).shape[0], self.layout.width), np.nan)
+        out = np.full((np.asarray(u).shape[0], self.layout.n), np.nan)
         out[self.delay :] = self.layout.matrices(self.scaled_theta).run(ys, us, x0)[0][:-1]
         return out
 
@@ -448,7 +416,7 @@ class StateNetwork(ScaledModel):
         return out
 
     def regressors(self, u: Array, y: Array) -> Array:
-        """Return state and input one sample before each prediction, scaled: (n_samples - lag, width + n_inputs)."""
+        """Return state and input one sample before each prediction, scaled: (n_samples - lag, n + n_inputs)."""
         X, k = self.states(u, y), self.lag
         us = (np.asarray(u, dtype=np.float64) - self.u_level) / self.u_scale
         return np.hstack([X[k - 1 : -1], us[k - 1 - self.delay : us.shape[0] - 1 - self.delay]])
@@ -462,27 +430,24 @@ class StateNetwork(ScaledModel):
     def _first_state(self, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
         """The first state that fits the first samples best, and its slopes by the weights."""
         y, u = y[: self._head], u[: self._head]
-        if self.layout.sensor:
-            return _search_first_state(self.layout, self.scaled_theta, y, u)
         return _solve_first_state(self.layout.matrices(self.scaled_theta), self.layout.n_theta, y, u, derive=derive)
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
-        layout = fields_json(self.layout, without=("dt", "sensor")) | {"anchored": self.layout.anchored}
+        layout = fields_json(self.layout, without=("dt",))
         return {"dt_s": self.dt, "delay": self.delay, "layout": layout, **self.numbers_json()}
 
     @classmethod
     def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
-        fields = document["layout"]
-        layout = read_as(Layout, {**fields, "dt": document["dt_s"], "sensor": not fields["anchored"]}, "layout")
+        layout = read_as(Layout, {**document["layout"], "dt": document["dt_s"]}, "layout")
         places = [*layout.rows, *(r for r, _ in layout.entries)]
         columns = [c for _, c in layout.entries]
         inside = min((*places, *columns, *layout.heads)) >= 0 and max(places) < layout.n
-        inside = inside and max(columns) <= layout.n + layout.n_inputs and max(layout.heads) < layout.width
+        inside = inside and max(columns) <= layout.n + layout.n_inputs and max(layout.heads) < layout.n
         if layout.form not in ("one-axis", "free") or not inside:
             raise EstimationError("this is not a state network: its states are not those of one. Write the file again")
-        n_cloud = layout.width + layout.n_inputs
+        n_cloud = layout.n + layout.n_inputs
         numbers = read_numbers(document, layout.n_theta, layout.n_inputs, layout.p, n_cloud)
         return cls(layout=layout, delay=int(document["delay"]), **numbers)
 
@@ -505,24 +470,3 @@ def _solve_first_state(m: Matrices, P: int, y: Array, u: Array, *, derive: bool)
     bent = np.stack([left @ linear.slopes(still[1], X, E, np.zeros((n, P))).reshape(-1, P) for X, E in runs])
     s: Array = np.ascontiguousarray(np.linalg.solve(O.T @ O, bent - O.T @ D), dtype=np.float64)
     return x0, s
-
-
-def _search_first_state(layout: Layout, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
-    """Best of searches from rest and both signs; Gauss-Newton slopes, exact for exactly fitted first samples, else to
-    first order.
-    """
-    P, first = layout.n_theta, float(y[0, 0]) if y.size else 0.0
-    problem = StateProblem(layout=layout, parts=((y, u),), weight=np.eye(1), held=slice(0, P))
-    best = None
-    for sign in _SIGNS:
-        x0 = np.zeros(layout.width)
-        x0[0], x0[-1] = sign * first, first
-        ended = search(problem, np.concatenate([theta, x0]), stage="", most=30, tolerance=1e-10)
-        if best is None or ended.cost < best.cost:
-            best = ended
-    assert best is not None
-    J = np.concatenate([r[:, 0] for r in replace(problem, held=slice(0, 0)).sample_rows(best.theta)])
-    s = np.zeros((layout.width, P))
-    if np.all(np.isfinite(J)):
-        s = -np.linalg.lstsq(J[:, P:-1], J[:, :P], rcond=1e-10)[0]
-    return best.theta[P:], np.ascontiguousarray(s)

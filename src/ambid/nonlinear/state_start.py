@@ -7,7 +7,6 @@ short shots, where unstable plants' costs are finite, first state, B and constan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
@@ -22,7 +21,7 @@ from ambid.estimation.linear import triangle_of
 from ambid.estimation.predictor import noise_floor
 from ambid.estimation.progress import Tick, guessed, silent
 from ambid.nonlinear.fit import LearningCurve
-from ambid.nonlinear.records import Parts, Scaled
+from ambid.nonlinear.records import Scaled
 from ambid.nonlinear.state_network import ONE_AXIS, Layout
 from ambid.nonlinear.state_training import State, add_gain, best_of, shift_inputs, train
 from ambid.signals.delay import find_delay as delay
@@ -36,12 +35,6 @@ _MOST = 5000  # samples that the first guess looks at
 _SHORT = 5  # iterations of a short training
 _WORTH = 2.0  # gain of the log likelihood, times two, for which a neighbour is taken
 _TRAINED = 3000  # samples that short trainings look at
-
-_REAL = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)  # poles of the grid
-_RADII = (0.6, 0.8, 0.9, 0.95, 0.98)
-_ANGLES = np.linspace(0.1, 1.6, 16)  # rad per sample
-_SENSOR = 0.3  # pole of the sensor at first
-_STEP = 0.4  # of the chain of states: near the size of 1 - pole for a plant that is sampled well
 
 _SHOT = 128  # samples
 _SHOTS = 8192  # samples of a record that are cut into shots
@@ -158,63 +151,6 @@ def matrices_json(layout: Layout, A: Array, B: Array, *, sampled: bool) -> dict[
     n, size = layout.n, np.array(layout.scale)
     unit = size[:n, None] / size
     return {"A": (pair[0] * unit[:, :n]).tolist(), "B": (pair[1] * unit[:, n:]).tolist()}
-
-
-# --- a grid of poles, where the sensor sees no sign -------------------------------------------------------------------
-
-
-def rank_grid(parts: Parts, n: int, delays: Sequence[int] = (1,)) -> list[tuple[Array, int, int, float]]:
-    """Return models gain q^-d / A(q^-1) of `n` poles behind a sensor without sign, best first, by A, input, its delay d
-    and the best-fitting gain: the sign is not in the data, and a search from a wrong one ends in a wrong minimum.
-    """
-    from scipy.signal import lfilter
-
-    y = np.concatenate([p[0][:, 0] for p in parts])
-    scored: list[tuple[float, int, tuple[Array, int, int, float]]] = []
-    for A in pole_grid(n):
-        for j in range(parts[0][1].shape[1]):
-            runs = [np.abs(lfilter([1.0], A, u[:, j])) for _, u in parts]
-            for d in delays:
-                x = np.concatenate([np.concatenate([np.zeros(d), r[: r.size - d]]) for r in runs])
-                size = float(x @ x)
-                if np.isfinite(size) and size > 0:
-                    gain = float(x @ y) / size
-                    scored.append((float(np.sum((gain * x - y) ** 2)), len(scored), (A, j, d, gain)))
-    return [model for _, _, model in sorted(scored, key=lambda found: found[:2])]
-
-
-def grid_starts(parts: Parts, n: int, most: int, dt: float) -> list[tuple[Layout, Array]]:
-    """Return the `most` best linear networks of `n` poles on the grid."""
-    layout = Layout.free(dt, (n,), (_STEP,) * (n - 1) + (0.0,), (1.0,) * (n + parts[0][1].shape[1]), sensor=True)
-    return [(layout, _grid_weights(layout, A, j, gain)) for A, j, _, gain in rank_grid(parts, n)[:most]]
-
-
-def _grid_weights(layout: Layout, A: Array, channel: int, gain: float) -> Array:
-    """Weights of the model gain q^-1 / A(q^-1): last row from the polynomial in q - 1, B from the impulse response."""
-    n = layout.n
-    shifted = np.poly1d(A)(np.poly1d([1.0, 1.0])).coeffs  # of the powers of q - 1, highest first
-    theta = np.zeros(layout.n_theta)
-    theta[:n] = -shifted[:0:-1] / _STEP ** np.arange(n - 1, -1, -1)
-    theta[n - 1] += 1.0
-    M = layout.weights(theta)[:, :n]
-    visible = np.stack([np.linalg.matrix_power(M, k)[0] for k in range(n)])
-    response = np.zeros(n)
-    for k in range(n):
-        response[k] = gain * (k == 0) - float(A[1 : k + 1] @ response[:k][::-1])
-    theta[n + channel : n + n * layout.n_inputs : layout.n_inputs] = np.linalg.solve(visible, response)
-    theta[-1] = _SENSOR
-    return theta
-
-
-def pole_grid(n: int) -> list[Array]:
-    """Return denominators (n + 1,) of linear models of `n` poles, of q^0, q^-1, ..."""
-    if n < 2:
-        return [np.array([1.0, -p]) for p in _REAL] if n else [np.ones(1)]
-    pairs = [np.array([1.0, -2 * r * np.cos(w), r * r]) for r in _RADII for w in _ANGLES]
-    pairs += [np.convolve([1.0, -p], [1.0, -q]) for p in _REAL for q in _REAL if q >= p]
-    for _ in range(n - 2):
-        pairs = [np.convolve(p, [1.0, -q]) for p in pairs for q in (_REAL if n == 3 else _REAL[1::2])]
-    return pairs
 
 
 # --- delay -----------------------------------------------------------------------------------------------------------

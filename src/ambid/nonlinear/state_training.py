@@ -26,10 +26,9 @@ from ambid.settings.caller import setting
 
 _ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
 _SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
-_FIRST = 3  # iterations for what units put out, before what they see is searched for
 _ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
 _PAST = 10  # samples of errors and inputs that a regression of the errors looks at
-_PRIOR, _PRIOR_MAGNITUDE = 3.0, 1.0  # deviation of hidden weights before the data, scaled; the second without sign
+_PRIOR = 3.0  # deviation of hidden weights before the data, scaled
 _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
 _FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed ..
 _SUSPECT = 0.005  # .. and from which it is worth a warning, if it is more than chance
@@ -43,7 +42,7 @@ class State:
 
     layout: Layout
     theta: Array  # (n_theta,), scaled
-    x0: Array  # (n_records, width), scaled, first states
+    x0: Array  # (n_records, n), scaled, first states
     noise: Array  # (n_outputs, n_outputs), scaled, covariance of its errors
     n_rows: int = 0  # samples in all
     prior: float | None = None  # deviation of the hidden layer's weights before the data
@@ -51,14 +50,14 @@ class State:
     @classmethod
     def of(cls, layout: Layout, theta: Array, data: Scaled) -> State:
         """Return a network that starts each record from its first outputs."""
-        x0 = np.zeros((len(data.parts), layout.width))
+        x0 = np.zeros((len(data.parts), layout.n))
         for k, (y, _) in enumerate(data.parts):
             x0[k, layout.heads] = y[0]
         return cls(layout=layout, theta=theta, x0=x0, noise=np.eye(layout.p))
 
     @property
     def vector(self) -> Array:
-        """Weights and first states, shape (n_theta + n_records width,)."""
+        """Weights and first states, shape (n_theta + n_records n,)."""
         return np.concatenate([self.theta, self.x0.ravel()])
 
     @property
@@ -186,10 +185,7 @@ def train(
     found, also of an interrupted search.
     """
     if damping is None:  # physics alone begins near: Gauss-Newton at once
-        damping = 1e-2 if state.layout.sensor else 1e-3 if state.layout.neurons else 1e-9
-    if state.layout.sensor and state.layout.neurons:
-        first, tick = portions(tick, (1.0, rounds))
-        state = _wake_units(state, data, iterations, damping, first)
+        damping = 1e-3 if state.layout.neurons else 1e-9
     at = state.at(state.problem(data), state.vector)
     if at is None:
         return None
@@ -217,22 +213,6 @@ def train(
     if ended.interrupted:
         raise KeyboardInterrupt
     return result
-
-
-def _wake_units(start: State, data: Scaled, iterations: int, damping: float, tick: Tick | None) -> State:
-    """Begin silent units against the linear part's errors under a strong prior; what they see is held for the first
-    iterations, or the prior would take it away.
-    """
-    k, (n_W1, _, _) = start.layout.n_directions, start.layout.hidden_sizes
-    if np.any(start.theta[k + n_W1 :]):
-        return start
-    free, stage = start.problem(data), "hidden layer"
-    begun = search(replace(free, held=slice(k, k + n_W1)), start.vector, stage=stage, most=_FIRST, damping=damping)
-    begun = search(
-        free, begun.theta, stage=stage, most=iterations, tolerance=1e-6, damping=damping, tick=tick
-    )  # fmt: skip
-    theta, x0 = free.split(begun.theta)
-    return replace(start, theta=theta, x0=x0)
 
 
 def train_each(starts: Sequence[State], data: Scaled, tick: Tick | None, **how: Any) -> list[Training]:
@@ -268,10 +248,9 @@ def add_units(state: State, neurons: int, seed: list[int]) -> State:
     new = state.widen(neurons=0).widen(neurons=neurons)
     layout, rng = new.layout, np.random.default_rng(seed)
     k, (n_W1, n_b1, _) = layout.n_directions, layout.hidden_sizes
-    size = 1.0 if layout.sensor else np.sqrt(layout.n + layout.n_inputs)
-    new.theta[k : k + n_W1] = rng.standard_normal(n_W1) / size
+    new.theta[k : k + n_W1] = rng.standard_normal(n_W1) / np.sqrt(layout.n + layout.n_inputs)
     new.theta[k + n_W1 : k + n_W1 + n_b1] = rng.standard_normal(n_b1)
-    return replace(new, prior=_PRIOR_MAGNITUDE if layout.sensor else _PRIOR)
+    return replace(new, prior=_PRIOR)
 
 
 # --- judgement -------------------------------------------------------------------------------------------------------
@@ -360,7 +339,7 @@ def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple
     unit, k = state.layout.unit, state.theta.size
     covariance = P[:k, :k] * unit[:, None] * unit
     extra, warnings = disagreement(state, fitting.rivals, covariance)
-    if state.layout.neurons and state.layout.anchored:
+    if state.layout.neurons:
         fitting.warnings.append(
             "A and B are the slope of the network at the operating point; their standard deviations do not include "
             "the error of its units there. Compare a fit with more neurons, or with smaller motion"
@@ -407,11 +386,9 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
     if state is None or model is None:
         return fitting.failed("the network does not stay finite on its training records: check the columns")
     if records[0].n_inputs and not all(x.open_loop for x in records) and not state.layout.gain:
-        way_out = "" if state.layout.sensor else "give noise = innovations, or "
         fitting.warnings.append(
-            f"trained on simulation errors, nn is biased by feedback: {way_out}give {setting('open_loop', True)} if "
-            "the records are "
-            "open loop"
+            "trained on simulation errors, nn is biased by feedback: give noise = innovations, or give "
+            f"{setting('open_loop', True)} if the records are open loop"
         )
     with fitting.stage("standard deviations"):
         covariance, origin = _estimate_spread(fitting, state, tick)
@@ -433,7 +410,7 @@ def _make_model(records: Sequence[IOData], data: Scaled, state: State, delay: in
     model = StateNetwork(
         layout=state.layout, theta=state.theta * state.layout.unit, delay=delay, u_level=data.u_level,
         u_scale=data.u_scale, y_level=data.y_level, y_scale=data.y_scale,
-        cloud=cloud_of(np.zeros((1, state.layout.width + state.layout.n_inputs))),
+        cloud=cloud_of(np.zeros((1, state.layout.n + state.layout.n_inputs))),
     )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):
         z = np.concatenate([model.regressors(x.u, x.y) for x in records])
