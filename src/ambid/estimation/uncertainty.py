@@ -1,4 +1,4 @@
-"""Statistics of a fit: information criteria, and covariances (sandwich, bootstrap in blocks of time) that keep the
+"""Statistics of a fit: information criteria, and covariances (sandwich) that keep the
 correlation of scores over n^0.6 samples (Kuensch 1989; Newey and West 1987). Inputs stay as measured under feedback.
 """
 
@@ -12,8 +12,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.linear import BLIND, directions, information_inverse, least_squares, triangle_of
-from ambid.estimation.progress import Tick
+from ambid.estimation.linear import information_inverse, triangle_of
 
 CRITERIA: tuple[str, ...] = ("ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc")
 EXACT = 1e-26  # part of the output's energy below which nothing is left to explain
@@ -135,7 +134,6 @@ def explained_by_past(
 
 
 WEAK = 0.25  # relative standard deviation from which a parameter counts as not identifiable
-REPEATS = 200
 _MANY = 20  # records from which on whole records are drawn
 _FEWEST = 8  # blocks of a record
 _BEGINS = 4  # of blocks, that are averaged over
@@ -219,61 +217,6 @@ def sandwich(
         middle += root.T @ prior @ root
     out: Array = root @ middle @ root.T
     return (out + out.T) / 2.0, condition
-
-
-def bootstrapped(
-    rows: Sequence[Array], priors: Array, seed: int, tick: Tick | None = None, *, repeats: int = REPEATS
-) -> Array:
-    """Return the covariance (n_theta, n_theta) of weights after a Gauss-Newton step on blocks of time drawn with
-    replacement, from `rows` (n_samples, n_outputs, n_theta + 1) of slopes and errors of unit variance, and rows of
-    priors that stay.
-
-    One step stays where the network is linear in its weights: whole trainings end in other weights of the same
-    function. Errors of a block are those of a fit without it; few blocks widen, as in the sandwich. The first block,
-    which alone shows the first state, is always there. Whole records are drawn where there are 20 or more.
-    """
-    whole = len(rows) >= _MANY
-    blocks = [_triangles(r, r.shape[0] if whole else block_length(r.shape[0])) for r in rows]
-    _lift(blocks, priors)
-    rng = np.random.default_rng([seed, 1])
-    estimates = []
-    for k in range(repeats):
-        if tick is not None:
-            tick("bootstrap", k / repeats)
-        if whole:
-            drawn = [blocks[j][0] for j in rng.integers(0, len(blocks), size=len(blocks))]
-        else:
-            drawn = []
-            for own in blocks:
-                times = np.bincount(rng.integers(1, len(own), size=len(own) - 1), minlength=len(own))
-                times[0] = 1
-                drawn += [np.sqrt(t) * b for t, b in zip(times, own, strict=True) if t]
-        R = triangle_of([np.concatenate([*drawn, priors])])
-        estimates.append(least_squares(R[:, :-1], R[:, -1]))
-    return np.atleast_2d(np.cov(np.array(estimates), rowvar=False)) * widening([r[:, 0] for r in rows])
-
-
-def _lift(blocks: list[list[Array]], priors: Array) -> None:
-    """Raise each block's errors to those that the fit without it has: its own are too small by what it pulled."""
-    R = triangle_of([np.concatenate([*(b for own in blocks for b in own), priors])])[:, :-1]
-    root = directions(R).root(BLIND)
-    for own in blocks:
-        for k, block in enumerate(own):
-            U, leverage, _ = np.linalg.svd(block[:, :-1] @ root, full_matrices=False)
-            along = U.T @ block[:, -1]
-            own[k] = block.copy()
-            own[k][:, -1] += U @ (along / np.maximum(1.0 - leverage**2, _SHOWN_ALONE) - along)
-
-
-def _triangles(rows: Array, length: int) -> list[Array]:
-    """Each block of time reduced to a triangle; the last one takes what is left over."""
-    n, width = rows.shape[0], rows.shape[2]
-    edges = [*range(0, n - length + 1, length), n]
-    if len(edges) > 2 and edges[-2] + length > n:
-        edges.pop(-2)
-    if len(edges) < 3 and length < n:
-        edges = [0, n // 2, n]
-    return [triangle_of([rows[a:b].reshape(-1, width)]) for a, b in pairwise(edges)]
 
 
 def natural_sizes(names: Sequence[str], theta: Mapping[str, float], reference: Mapping[str, float]) -> Array:

@@ -182,7 +182,7 @@ class NonlinearFit(FittedModel):
     covariance : ndarray, shape (n_theta, n_theta) or None
         Of ``model.theta``; zeros where a parameter was not estimated. None where the method has none to give.
     covariance_from : str
-        ``"information"``, ``"laplace"``, ``"sandwich"`` (errors not taken as white), ``"bootstrap"``; empty without.
+        ``"information"``, ``"laplace"``, ``"sandwich"`` (errors not taken as white); empty without.
     n_estimated : int
         Numbers that were estimated.
     noise_covariance : ndarray, shape (n_outputs, n_outputs), SI

@@ -333,7 +333,6 @@ class Draft(Attempt, Generic[F]):
     free: bool = False  # whether `theta` is that of simulation errors
     stopped_early: bool = False
     held_out: float = float("nan")  # error on held-out data; NaN without
-    sampled: Array | None = None  # covariance by bootstrap
 
     def keep(self, theta: Array) -> None:
         """Take over other parameters."""
@@ -456,8 +455,6 @@ def finish(
     covariance = posterior.covariance
     if robust and not why_not:
         covariance = sandwich_at(problem, problem.whole(draft.theta)[problem.live])
-    if draft.sampled is not None:
-        covariance, origin = draft.sampled, "bootstrap"
     if how == "none":
         why_not = "no standard deviations: no covariance was requested"
     elif draft.free and origin == "laplace" and not why_not:

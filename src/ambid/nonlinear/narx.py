@@ -1,7 +1,7 @@
 """Neural NARX: a linear part and one hidden layer of tanh units on lagged outputs and inputs (Billings 2013, sec. 8.2).
 
 Lags and neurons (where open) -> several random starts watched on held-out data -> the best on all -> simulation errors
-(option) -> covariance (Laplace, sandwich, bootstrap). Scaled hidden weights are N(0, prior^2): it counts only where the
+(option) -> covariance (Laplace, sandwich). Scaled hidden weights are N(0, prior^2): it counts only where the
 data do not speak (units alike), and makes the information matrix regular.
 """
 
@@ -19,7 +19,6 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
-from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, number, read_settings, whole
 from ambid.nonlinear.lagged import Block, LaggedFunction, Linear, Regressors, Tanh, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
@@ -68,8 +67,8 @@ class NarxSettings:
         "prediction or simulation: errors that are minimised in the end; prediction", "prediction", "simulation"
     )
     uncertainty: str = choice(
-        "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich for simulation); auto",
-        "auto", "laplace", "sandwich", "bootstrap", "none",
+        "laplace, sandwich (coloured errors), none, auto (sandwich for simulation); auto",
+        "auto", "laplace", "sandwich", "none",
     )  # fmt: skip
 
 
@@ -131,7 +130,7 @@ class NarxFunction(LaggedFunction):
 
 def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
     """Identify a neural NARX model, y(t) = L z + c + W2 tanh(W1 z + b1) + e(t), biased under feedback or with coloured
-    noise, as errors are taken as white. `seed`: of starts and bootstrap; `tick`: called with the stage, may raise
+    noise, as errors are taken as white. `seed`: of starts; `tick`: called with the stage, may raise
     KeyboardInterrupt.
     """
     s = read_settings(NarxSettings, "narx", settings)
@@ -168,8 +167,8 @@ def narx_problem(
 
 
 def _identify(s: NarxSettings, draft: Draft[NarxFunction], tick: Tick | None) -> None:
-    free, many, parts = s.focus == "simulation", s.uncertainty == "bootstrap", draft.data.parts
-    choosing, training, refining, last = portions(tick, (3.0, 5.0, 8.0 * free, 4.0 * many))
+    free, parts = s.focus == "simulation", draft.data.parts
+    choosing, training, refining = portions(tick, (3.0, 5.0, 8.0 * free))
     with draft.stage("choice"):
         function = _choose_sizes(s, draft, choosing)
     with draft.stage("training"):
@@ -178,11 +177,6 @@ def _identify(s: NarxSettings, draft: Draft[NarxFunction], tick: Tick | None) ->
         with draft.stage("simulation errors"):
             problem_of = partial(narx_problem, function, parts, prior=s.prior, free=True)
             refine(draft, problem_of, s.iterations, refining, "neurons")
-    if many:
-        with draft.stage("bootstrap"):
-            problem = narx_problem(function, parts, draft.theta, s.prior, free=draft.free)
-            rows = problem.sample_rows(draft.theta)
-            draft.sampled = bootstrapped(rows, problem.prior_rows(draft.theta), draft.seed, last)
 
 
 def _choose_sizes(s: NarxSettings, draft: Draft[NarxFunction], tick: Tick | None) -> NarxFunction:

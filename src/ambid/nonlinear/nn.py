@@ -47,8 +47,8 @@ _BETTER = 1e-2  # of the errors' log determinant, by which a network from the gl
 _MORE = 2  # states beyond the outputs, for the delay
 _LARGEST = 5  # states beyond the outputs that are tried
 _PATIENCE = 2  # states beyond the best, after which no more are tried
-_DELAY, _TRAINING, _RESCUE, _AGAIN, _SPREAD = (  # shares of the time: rescues are rare
-    (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.0),
+_DELAY, _TRAINING, _RESCUE, _AGAIN = (  # shares of the time: rescues are rare
+    (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 1.0),
 )  # fmt: skip
 
 
@@ -78,8 +78,8 @@ class NnSettings:
         1_000_000,
     )
     uncertainty: str = choice(
-        "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich if not white); auto",
-        *("auto", "laplace", "sandwich", "bootstrap", "none"),
+        "laplace, sandwich (coloured errors), none, auto (sandwich if not white); auto",
+        *("auto", "laplace", "sandwich", "none"),
     )
 
 
@@ -137,7 +137,7 @@ def nn(
     if state is not None and s["form"] == "free":
         m = state.layout.matrices(state.theta)
         fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B, sampled=True)
-    return finish(fitting, reason, part_of(tick, *_SPREAD))
+    return finish(fitting, reason)
 
 
 def _heads(fitting: Fitting) -> tuple[int, ...]:

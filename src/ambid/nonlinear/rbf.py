@@ -10,7 +10,6 @@ rate |phi|^2) e, which grows over 2/|phi|^2.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
@@ -60,7 +59,6 @@ _FIRST = 12  # units with which lags are compared
 _MIDDLE = 1.4  # width, where it is not the question
 _AS_GOOD = 1.01
 _FAR = 1e6  # times as bad as one step ahead: a free run that diverges
-_NEIGHBOURS = 2
 _MOST_ROWS = 4000  # on which units are placed
 _CANDIDATES = 200  # of the data that may become a centre
 _PASSES = 20  # of steepest descent over the records
@@ -84,10 +82,7 @@ class RbfSettings:
     nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
     linear: int = whole("1 for a linear part with the units, 0 for none; 1", 0, 1, 1)
     neurons: int | None = whole("units; chosen by held-out error", 0, 200)
-    centres: str = choice("ols (orthogonal least squares among the data) or kmeans; ols", "ols", "kmeans")
-    width: float | None = number(
-        "in sizes of the data, with centres=kmeans in distances of neighbours; chosen by held-out error", 0.01, 100.0
-    )
+    width: float | None = number("in sizes of the data; chosen by held-out error", 0.01, 100.0)
     held_out: float = number("part at the end of each record that is held out for validation; 0.2", 0.0, 0.5, 0.2)
     prior: float | None = number(
         "prior standard deviation of the units' weights, scaled; by restricted likelihood", 1e-6, 1e9
@@ -371,7 +366,6 @@ class Placing:
         self.x, self.y = x[::step], y[::step]
         self.seen = self.x @ function.metric.T
         self.size = typical_size(self.seen)
-        self.by_means = cache(lambda k: k_means(self.seen, k, np.random.default_rng([seed, 2])))
         self.by_ols = cache(self._order)
 
     def start(self, neurons: int, width: float) -> tuple[RbfFunction, Array]:
@@ -379,12 +373,10 @@ class Placing:
         neurons = min(neurons, max((self.x.shape[0] - self.function.n_line) // 2, 0))  # two samples for each
         C = np.empty((0, self.function.units.n_seen))
         if neurons and C.shape[1]:
-            C = self.by_means(neurons) if self.s.centres == "kmeans" else self.by_ols(width)[:neurons]
+            C = self.by_ols(width)[:neurons]
         function = replace(self.function, neurons=C.shape[0])
-        widths = np.full(C.shape[0], width * self.size)
-        if self.s.centres == "kmeans":
-            widths = width * neighbour_widths(C, _NEIGHBOURS, self.size)
-        return function, np.concatenate([np.zeros(function.n_weights), C.ravel(), np.log(widths)])
+        widths = np.full(C.shape[0], np.log(width * self.size))
+        return function, np.concatenate([np.zeros(function.n_weights), C.ravel(), widths])
 
     def _order(self, width: float) -> Array:
         n, rng = self.x.shape[0], np.random.default_rng([self.seed, 2])
@@ -400,16 +392,6 @@ def typical_size(x: Array) -> float:
     """Return the root mean square distance from the middle of the data."""
     size = float(np.sqrt(np.sum(np.var(x, axis=0))))
     return size if size > 0 else 1.0
-
-
-def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
-    """Return at most `k` centres by k-means++ and Lloyd's iterations; fewer where there are fewer different points."""
-    from scipy.cluster.vq import kmeans2
-
-    k = min(k, np.unique(x, axis=0).shape[0])
-    with warnings.catch_warnings():  # an empty cluster keeps its centre
-        warnings.simplefilter("ignore", UserWarning)
-        return np.asarray(kmeans2(x, k, iter=50, minit="++", seed=rng)[0])
 
 
 def ols_order(candidates: Array, basis: Array, y: Array, most: int) -> list[int]:
@@ -437,16 +419,6 @@ def ols_order(candidates: Array, basis: Array, y: Array, most: int) -> list[int]
         alive[pick] = False
         order.append(pick)
     return order
-
-
-def neighbour_widths(C: Array, among: int, otherwise: float) -> Array:
-    """Return the root mean square distance of each centre to its nearest ones (Moody and Darken 1989)."""
-    if C.shape[0] < 2:
-        return np.full(C.shape[0], otherwise)
-    squares = np.sum((C[:, None, :] - C) ** 2, axis=2)
-    near = np.sort(squares, axis=1)[:, 1 : 1 + among]
-    widths = np.sqrt(np.mean(near, axis=1))
-    return np.where(widths > 1e-6 * otherwise, widths, otherwise)
 
 
 # --- output weights ---------------------------------------------------------------------------------------------------

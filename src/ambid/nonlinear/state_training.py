@@ -17,7 +17,7 @@ from ambid.blackbox.data import IOData
 from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
-from ambid.estimation.uncertainty import bootstrapped, explained_by_past
+from ambid.estimation.uncertainty import explained_by_past
 from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit
 from ambid.nonlinear.lagged_problem import sandwich_at
 from ambid.nonlinear.records import Scaled, cloud_of
@@ -304,7 +304,7 @@ def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
 # --- standard deviations ---------------------------------------------------------------------------------------------
 
 
-def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple[Array | None, str]:
+def _estimate_spread(fitting: Fitting, state: State) -> tuple[Array | None, str]:
     """Covariance of trained weights in the model's units, first states counted, and its source; warnings say what to
     mind.
     """
@@ -330,9 +330,7 @@ def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple
         return None, ""
     assert P is not None
     origin = "laplace" if state.layout.neurons else "information"
-    if how == "bootstrap":
-        P, origin = bootstrapped(problem.sample_rows(v), problem.prior_rows(v), fitting.seed, tick), "bootstrap"
-    elif how == "sandwich" or (how == "auto" and not is_white(state, data)):
+    if how == "sandwich" or (how == "auto" and not is_white(state, data)):
         robust = sandwich_at(problem, v)
         assert robust is not None
         P, origin = robust, "sandwich"
@@ -374,7 +372,7 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
 # --- the fit ---------------------------------------------------------------------------------------------------------
 
 
-def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
+def finish(fitting: Fitting, reason: str) -> NonlinearFit:
     """Return a trained network's fit, failed where there is none (`reason`), or none that runs on its own records."""
     state, data, records = fitting.state, fitting.data, fitting.records
     fitting.settings = {"states": 0, "neurons": 0, **fitting.settings, "delay": fitting.delay}
@@ -391,7 +389,7 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
             f"{setting('open_loop', True)} if the records are open loop"
         )
     with fitting.stage("standard deviations"):
-        covariance, origin = _estimate_spread(fitting, state, tick)
+        covariance, origin = _estimate_spread(fitting, state)
     fitting.timing_s["all"] = sum(fitting.timing_s.values())
     freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
     noise = state.noise * state.n_rows / freedom

@@ -45,7 +45,6 @@ _SOURCES = {
     "information": "the information matrix",
     "laplace": "Laplace's approximation",
     "sandwich": "the sandwich formula, for coloured errors",
-    "bootstrap": "bootstrap",
 }
 
 

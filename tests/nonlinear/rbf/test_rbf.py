@@ -55,8 +55,6 @@ def test_a_known_network_is_found_with_its_centres_and_widths() -> None:
     ("told", "limit"),
     [
         ({}, 0.045),
-        ({"centres": "kmeans"}, 0.045),
-        ({"centres": "kmeans", "neurons": 24}, 0.07),
         ({"linear": 0}, 0.045),
         ({"trained": "all", "neurons": 6}, 0.055),
     ],
@@ -217,8 +215,8 @@ def test_feedback_is_warned_of_and_nothing_to_predict_from_refused() -> None:
     assert not any("feedback" in w for w in rbf([record], {"neurons": 4}).warnings)
     with pytest.raises(EstimationError, match="nothing is left"):
         rbf([record], {"ny": 0, "nu": 0})
-    with pytest.raises(EstimationError, match="kmeans"):
-        rbf([record], {"centres": "kmean"})
+    with pytest.raises(EstimationError, match="recursive"):
+        rbf([record], {"training": "recursiv"})
 
 
 @pytest.mark.parametrize(
@@ -256,13 +254,9 @@ def test_numbers_that_the_data_do_not_tell_apart_are_named() -> None:
 
 def test_units_that_have_no_place_are_left_out_and_told() -> None:
     record, _ = bumpy(120, 13, 0.1)
-    for centres in ("ols", "kmeans"):
-        fit = rbf([record], {"ny": 1, "nu": 1, "neurons": 100, "centres": centres})
-        assert 20 < fit.settings["neurons"] == units_of(fit).neurons < 60
-        assert any("instead of 100" in w for w in fit.warnings)
-    steps = data(np.repeat([0.0, 1.0, 0.0, 1.0], 40), record.y[:, 0].repeat(2)[:160])
-    few = rbf([steps], {"ny": 0, "nu": 1, "neurons": 8, "centres": "kmeans"})
-    assert few.settings["neurons"] == 2
+    fit = rbf([record], {"ny": 1, "nu": 1, "neurons": 100})
+    assert 20 < fit.settings["neurons"] == units_of(fit).neurons < 60
+    assert any("instead of 100" in w for w in fit.warnings)
     assert not any("instead" in w for w in rbf([record], {"ny": 1, "nu": 1}).warnings)
 
 

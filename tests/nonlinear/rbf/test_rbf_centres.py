@@ -1,4 +1,4 @@
-"""Centres and widths: orthogonal least squares beside a search by hand, k-means, neighbours."""
+"""Centres and widths: orthogonal least squares beside a search by hand."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.polynomial import MatrixCandidates, select_terms
-from ambid.nonlinear.rbf import k_means, neighbour_widths, ols_order, typical_size
+from ambid.nonlinear.rbf import ols_order, typical_size
 
 
 def left(columns: np.ndarray, y: np.ndarray) -> float:
@@ -53,24 +53,5 @@ def test_what_the_model_holds_already_is_not_taken_again() -> None:
     assert order[0] in (1, 2, 3)
 
 
-def test_k_means_finds_clusters_for_every_seed() -> None:
-    rng = np.random.default_rng(7)
-    middles = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
-    x = np.concatenate([m + 0.3 * rng.standard_normal((50, 2)) for m in middles])
-    means = np.array([x[50 * k : 50 * k + 50].mean(axis=0) for k in range(4)])
-    for seed in range(5):
-        found = k_means(x, 4, np.random.default_rng(seed))
-        np.testing.assert_allclose(found[np.lexsort(found.round().T[::-1])], means[np.lexsort(middles.T[::-1])])
-    again = [k_means(x, 9, np.random.default_rng(1)) for _ in range(2)]
-    np.testing.assert_array_equal(*again)
-    spread = [np.sum(np.min(np.sum((x[:, None] - C) ** 2, axis=2), axis=1)) for C in (means, again[0])]
-    assert spread[1] < 0.8 * spread[0]
-    assert k_means(np.repeat(middles, 3, axis=0), 9, np.random.default_rng(0)).shape == (4, 2)
-
-
-def test_widths_by_neighbours() -> None:
-    C = np.array([[0.0], [1.0], [3.0], [3.0]])
-    np.testing.assert_allclose(neighbour_widths(C, 2, 5.0), [np.sqrt(5.0), np.sqrt(2.5), np.sqrt(2.0), np.sqrt(2.0)])
-    np.testing.assert_allclose(neighbour_widths(C, 1, 5.0), [1.0, 1.0, 5.0, 5.0])  # one on top of another
-    np.testing.assert_allclose(neighbour_widths(C[:1], 2, 5.0), [5.0])
+def test_the_size_of_data_is_their_distance_from_the_middle() -> None:
     assert typical_size(np.array([[1.0, 1.0], [-1.0, 1.0]])) == 1.0
