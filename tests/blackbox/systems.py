@@ -9,7 +9,7 @@ import scipy.signal
 
 from ambid.blackbox.blocks import transfer_functions
 from ambid.blackbox.data import IOData
-from ambid.blackbox.model import TransferModel
+from ambid.blackbox.model import BlackBoxModel, TransferModel
 from ambid.blackbox.prediction import held_transfer
 from tests.blackbox.instrumental import block_benches
 
@@ -36,6 +36,14 @@ _OWN = {
 def orders_for(name: str, wanted: tuple[str, ...]) -> dict[str, int]:
     """Orders that hold the truth, or come near it."""
     return {k: _OWN.get(name, {}).get(k, ORDERS[k]) for k in wanted}
+
+
+def noise_response(model: BlackBoxModel, omega: np.ndarray) -> np.ndarray:
+    """H at `omega` in rad/s, shape (n_frequencies, n_outputs, n_outputs), from the innovations form."""
+    m = model.state_space()
+    assert m.dt is not None
+    z = np.exp(1j * omega * m.dt)[:, None, None]
+    return np.eye(m.n_outputs) + m.C @ np.linalg.solve(z * np.eye(m.order) - m.A, m.K[None] + 0j)
 
 
 def truth(omega: np.ndarray) -> np.ndarray:

@@ -80,19 +80,6 @@ class BlackBoxModel(ABC):
         """
 
     @abstractmethod
-    def noise_response(self, omega: Array) -> Complex:
-        """Return H.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
-        """
-
-    @abstractmethod
     def state_space(self) -> StateSpaceModel:
         """Return the model in innovations form."""
 
@@ -254,11 +241,6 @@ class StateSpaceModel(BlackBoxModel):
     def frequency_response(self, omega: Array) -> Complex:
         """As `BlackBoxModel.frequency_response`."""
         return np.asarray(self.D + self.C @ np.linalg.solve(self._pencil(omega), self._wide(self.B, omega)))
-
-    def noise_response(self, omega: Array) -> Complex:
-        """As `BlackBoxModel.noise_response`."""
-        inner = np.linalg.solve(self._pencil(omega), self._wide(self.K, omega))
-        return np.asarray(np.eye(self.n_outputs) + self.C @ inner)
 
     def frequency_response_derivative(self, omega: Array) -> Complex:
         """As `BlackBoxModel.frequency_response_derivative`."""
@@ -572,14 +554,6 @@ class PolynomialModel(RationalModel):
         g = [[_at(b, z) / (_at(p.A, z) * _at(f, z)) for b, f in zip(p.B, p.F, strict=True)] for p in self.outputs]
         return np.moveaxis(np.array(g, dtype=np.complex128).reshape(self.n_outputs, self.n_inputs, z.size), 2, 0)
 
-    def noise_response(self, omega: Array) -> Complex:
-        """As `BlackBoxModel.noise_response`."""
-        z = 1.0 / self._points(omega)
-        h = np.zeros((z.size, self.n_outputs, self.n_outputs), dtype=np.complex128)
-        for o, p in enumerate(self.outputs):
-            h[:, o, o] = _at(p.C, z) / (_at(p.A, z) * _at(p.D, z))
-        return h
-
     def frequency_response_derivative(self, omega: Array) -> Complex:
         """As `BlackBoxModel.frequency_response_derivative`."""
         z, g = 1.0 / self._points(omega), self.frequency_response(omega)
@@ -747,10 +721,6 @@ class TransferModel(RationalModel):
         for o, i in np.ndindex(self.n_outputs, self.n_inputs):
             g[:, o, i] = np.polyval(self.num[o][i], s) / np.polyval(self.den[o][i], s) * lag[:, i]
         return g
-
-    def noise_response(self, omega: Array) -> Complex:
-        """As `BlackBoxModel.noise_response`."""
-        return np.broadcast_to(np.eye(self.n_outputs, dtype=np.complex128), (omega.size,) + (self.n_outputs,) * 2)
 
     def frequency_response_derivative(self, omega: Array) -> Complex:
         """As `BlackBoxModel.frequency_response_derivative`."""

@@ -9,6 +9,7 @@ from ambid.blackbox.model import response_covariance
 from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.errors import EstimationError
 from tests.blackbox.instrumental.records import io_data, monte_carlo, second_order
+from tests.blackbox.systems import noise_response
 from tests.tiers import runs
 
 A, B = np.array([1, -1.5, 0.7]), np.array([0, 1.0, 0.5])
@@ -72,7 +73,7 @@ def test_offsets_noise_model_and_poles():
     omega = np.array([0.1, 0.5, 1.5])
     z = np.exp(-1j * omega)
     H = np.polyval([0.3, 0.9, 1], z) / (np.polyval(A[::-1], z) * (1 - 0.8 * z))
-    np.testing.assert_allclose(np.abs(fit.model.noise_response(omega)[:, 0, 0]), np.abs(H), rtol=0.1)
+    np.testing.assert_allclose(np.abs(noise_response(fit.model, omega)[:, 0, 0]), np.abs(H), rtol=0.1)
     assert fit.noise_covariance[0, 0] == pytest.approx(0.25, rel=0.05)
 
 
