@@ -20,7 +20,9 @@ from ambid.recursive.lines import Event
 from ambid.signals import multisine
 from ambid.simulation.bench import VaryingLoop
 from ambid.simulation.plant import LinearPlant
-from ambid.simulation.scenarios import scenario_blocks
+from ambid.simulation.rig_bench import Bench
+from ambid.simulation.scenarios import amplitude_for, one_period
+from ambid.simulation.scenarios import scenario as scenario_of
 from ambid.simulation.variation import Variation
 from ambid.tracking.evidence import Samples
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
@@ -57,11 +59,18 @@ def preset_bench() -> TrackBench:
     bench = preset("unstable-bearing")
 
     def stream(scenario: str, seed: int, seconds: float, at_s: float) -> Iterator[tuple[int, Samples]]:
-        more: dict[str, float] = {} if scenario == "quiet" else {"amplitude": _amplitude()}
-        more |= {} if scenario in ("quiet", "steady") else {"at_s": at_s}
-        for block in scenario_blocks(scenario, bench, duration_s=seconds, seed=seed, block=_CHUNK, **more):
-            s = block.signals
-            yield block.first, _samples(s["voltage"], s["position"], s["current"])
+        b, s = Bench.of(bench, None, True), scenario_of(scenario)
+        period = _amplitude() * one_period(b, seed) if s.excited else np.zeros(1)
+        running = VaryingLoop(
+            b.plant, s.vary(b, at_s, s.size_for(b, None), seconds), rate_hz=b.rate_hz, seed=seed, loop=b.loop,
+            limits=b.limits, noise=b.noise, operating_point=b.point,
+        )  # fmt: skip
+        outputs = b.linear.model.outputs
+        for first in range(0, round(seconds * b.rate_hz), _CHUNK):
+            n = min(_CHUNK, round(seconds * b.rate_hz) - first)
+            done = running.advance(period[(first + np.arange(n)) % period.size])
+            position, current = (done.measured[:, outputs.index(x)] for x in ("position", "current"))
+            yield first, _samples(done.command, position, current)
 
     return TrackBench(name="unstable-bearing", truth=bench.parameters, stream=stream)
 
@@ -69,9 +78,6 @@ def preset_bench() -> TrackBench:
 @cache
 def _amplitude() -> float:
     """What `ambid scenario` chooses, once for all seeds."""
-    from ambid.simulation.rig_bench import Bench
-    from ambid.simulation.scenarios import amplitude_for, one_period
-
     b = Bench.of(preset("unstable-bearing"), None, None)
     return amplitude_for(b, one_period(b, 1), 1)
 

@@ -1,7 +1,5 @@
 """Scenarios: each does what its name says, with the truth beside it, as a record and as a stream."""
 
-import tracemalloc
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +12,8 @@ from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.record import read_record, write_record
 from ambid.rig import Rig, default_rig, rig_from_text
-from ambid.simulation import Simulation, scenario_blocks, simulate_preset, simulate_scenario, truth_columns
-from ambid.simulation.scenarios import losses, scenario, scenario_names
+from ambid.simulation import Simulation, simulate_preset, simulate_scenario, truth_columns
+from ambid.simulation.scenarios import scenario, scenario_names
 
 BEARING = preset("unstable-bearing")
 RATE = 20_000
@@ -146,51 +144,6 @@ def test_off_line_identification_finds_the_truth_before_and_after(name: str, aft
             assert found.sd < 0.01 * abs(truth)
 
 
-def numbers(name: str, block: int) -> dict[str, np.ndarray]:
-    amplitude = None if name == "quiet" else 8.0
-    blocks = list(scenario_blocks(name, BEARING, duration_s=2.0, seed=4, amplitude=amplitude, block=block))
-    assert [b.first for b in blocks] == list(range(0, 2 * RATE, block))
-    assert all(b.time_s.size == min(block, 2 * RATE - b.first) for b in blocks)
-    columns = {n: np.concatenate([b.signals[n] for b in blocks]) for n in blocks[0].signals}
-    columns |= {f"true_{n}": np.concatenate([b.truth[n] for b in blocks]) for n in blocks[0].truth}
-    return {"time": np.concatenate([b.time_s for b in blocks]), **columns}
-
-
-@pytest.mark.parametrize("name", ["quiet", "drift", "spin-up", "sensor-gain", "saturation", "dropped"])
-def test_a_stream_has_the_numbers_of_the_record_whatever_its_blocks(name: str) -> None:
-    coarse, fine = numbers(name, 16_384), numbers(name, 1001)
-    record = run(name, 2.0, log_excitation=True).record
-    assert set(coarse) == {"time", *record.names}
-    for channel, values in coarse.items():
-        assert np.array_equal(fine[channel], values, equal_nan=True)
-        whole = record.time_s if channel == "time" else record[channel]
-        known = np.isfinite(values)
-        assert known.all() or name == "dropped"
-        assert np.array_equal(values[known], whole[known])
-    if name == "dropped":
-        lost = np.zeros(2 * RATE, dtype=bool)
-        for x in losses(2 * RATE, 0.01, 4, first=int(0.2 * RATE)):
-            lost[x.first : x.stop] = True
-        gone = np.isnan(np.column_stack([coarse[c] for c in ("voltage", "current", "position", "excitation")]))
-        assert np.array_equal(gone.any(axis=1), lost)
-        assert 0 < gone.all(axis=1).sum() < gone.any(axis=1).sum()
-
-
-def peak_memory(duration_s: float) -> int:
-    stream = scenario_blocks("quiet", BEARING, duration_s=duration_s, seed=0, block=1000)
-    deque((next(stream) for _ in range(20)), maxlen=0)
-    tracemalloc.start()
-    try:
-        deque(stream, maxlen=0)
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-def test_a_long_stream_takes_the_memory_of_a_short_one() -> None:
-    assert peak_memory(40.0) < 1.1 * peak_memory(4.0)
-
-
 BALL = """schema = "ambid.rig/1"
 name = "ball"
 model = "one-axis"
@@ -258,8 +211,6 @@ def test_bad_requests_are_refused(rig: Rig) -> None:
     ):
         with pytest.raises(ModelError, match=said):
             simulate_scenario(name, BEARING, seed=0, **more)  # type: ignore[arg-type]
-    with pytest.raises(ModelError, match="at least one"):
-        scenario_blocks("steady", BEARING, block=0)
     free = replace(rig, limits=None)
     with pytest.raises(ModelError, match="Give one"):
         simulate_scenario("steady", free)

@@ -8,7 +8,7 @@ import pytest
 from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulation import scenario_blocks, simulate_preset
+from ambid.simulation import simulate_preset, simulate_scenario, truth_columns
 from ambid.tracking.evidence import Samples
 from ambid.tracking.numbers import tracked_numbers
 from ambid.tracking.rpem import PhysicalRpem
@@ -101,15 +101,14 @@ def drifted(seed, duration_s, size):
     r, errors, relative, widths = PhysicalRpem(bearing_start(20_000, 1)), [], [], []
     places, truth = {k: j for j, k in enumerate(r.names)}, preset(BEARING).parameters
     now = np.array([truth[k] for k in r.names])
-    for block in scenario_blocks(
-        "drift", preset(BEARING), duration_s=duration_s, seed=seed, size=size, at_s=0.0, block=4000
-    ):
-        s = block.signals
-        r.update(s["voltage"][:, None], np.column_stack([s["position"], s["current"]]))
-        for name in block.truth:
-            if name in places:
-                now[places[name]] = block.truth[name][-1]
-        if block.first > 0.2 * duration_s * 20_000:
+    record = simulate_scenario("drift", preset(BEARING), duration_s=duration_s, seed=seed, size=size, at_s=0.0).record
+    u, y = record["voltage"].values[:, None], np.stack([record[x].values for x in ("position", "current")], axis=1)
+    courses = {name: c.values for name, c in truth_columns(record).items() if name in places}
+    for first in range(0, record.n_samples, 4000):
+        r.update(u[first : first + 4000], y[first : first + 4000])
+        for name, values in courses.items():
+            now[places[name]] = values[first : first + 4000][-1]
+        if first > 0.2 * duration_s * 20_000:
             sd = np.sqrt(np.diag(r.covariance))
             errors.append((r.estimate - now) / sd)
             relative.append(r.estimate[places["R"]] / now[places["R"]] - 1.0)

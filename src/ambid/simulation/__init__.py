@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from ambid.simulation.rig_bench import plant_of_rig as plant_of_rig
     from ambid.simulation.rig_bench import simulate_preset as simulate_preset
     from ambid.simulation.rig_bench import simulate_rig as simulate_rig
-    from ambid.simulation.scenarios import scenario_blocks as scenario_blocks
     from ambid.simulation.scenarios import simulate_scenario as simulate_scenario
     from ambid.simulation.scenarios import truth_columns as truth_columns
     from ambid.simulation.variation import Schedule as Schedule

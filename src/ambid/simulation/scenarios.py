@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import gzip
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -299,18 +299,6 @@ _CHUNK = 16384  # samples that are simulated at once
 _LARGEST = 10**8  # samples of one record: it has to fit into memory
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ScenarioBlock:
-    """Consecutive samples of a scenario."""
-
-    first: int  # number of the first sample
-    time_s: Array  # sampling instants
-    # as logged, SI, by role: input, outputs, ``excitation``, and ``speed`` and ``angle`` where the rotor turns; lost
-    # samples of the scenario ``dropped`` are NaN
-    signals: Mapping[str, Array]
-    truth: Mapping[str, Array]  # what varies, SI: parameters, ``gain_<output>``, ``force``, ``unbalance``, its phase
-
-
 class Course(TypedDict, total=False):
     """How a scenario runs; what is left out is the scenario's, or the bench's, own."""
 
@@ -377,37 +365,6 @@ def simulate_scenario(
     if run.bench.rig is not None:
         record = as_columns(record, run.bench.rig, np.full(record.n_samples, run.bench.point.position))
     return replace(done, record=record)
-
-
-def scenario_blocks(
-    name: str | Scenario, bench: Preset | Rig, *, block: int = 1000, **course: Unpack[Course]
-) -> Iterator[ScenarioBlock]:
-    """Simulate a scenario block by block; the numbers are those of `simulate_scenario`, whatever the block's size.
-
-    Memory is that of some blocks: an hour at 20 kHz costs no more than a second.
-
-    Parameters
-    ----------
-    name, bench
-        As in `simulate_scenario`.
-    block : int
-        Samples of a block; the last one may be shorter.
-    **course
-        As in `simulate_scenario`.
-
-    Yields
-    ------
-    ScenarioBlock
-        In order. Its arrays are views that nobody else writes to.
-
-    Raises
-    ------
-    ModelError
-        As `simulate_scenario`, at once; the bench may also fail on the way.
-    """
-    if block < 1:
-        raise ModelError(f"a block of {block} samples; it has at least one. Give another size")
-    return _Run(name, bench, **course).blocks(block)
 
 
 def truth_columns(record: Record) -> Mapping[str, Channel]:
@@ -509,32 +466,3 @@ class _Run:
         if self.scenario.size_is:
             settings |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
         return settings
-
-    def blocks(self, block: int) -> Iterator[ScenarioBlock]:
-        """Yield the scenario block by block, lost samples NaN."""
-        model, lost = self.bench.linear.model, list[tuple[int, int, int]]()  # first, stop and column, -1: all
-        if self.scenario.dropped:
-            bursts = losses(self.n_samples, self.size, self.seed, first=self.first_sample)
-            lost = [(x.first, x.stop, x.column if x.kind == "cells" else -1) for x in bursts]
-        chunk = block * math.ceil(_CHUNK / block)
-        for first in range(0, self.n_samples, chunk):
-            u = self.excitation(first, min(chunk, self.n_samples - first))
-            stretch = self.running.advance(u)
-            signals = {model.inputs[0]: stretch.command}
-            signals |= {o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(model.outputs)}
-            signals["excitation"] = u
-            if stretch.speed is not None and stretch.angle is not None:
-                signals |= {"speed": stretch.speed, "angle": stretch.angle}
-            columns, stop = list(signals.values()), first + u.size
-            for a, b, column in (x for x in lost if x[1] > first and x[0] < stop):
-                for values in columns if column < 0 else [columns[column % len(columns)]]:
-                    values[max(a - first, 0) : min(b, stop) - first] = np.nan
-            time = (first + np.arange(u.size)) / self.bench.rate_hz
-            for k in range(0, u.size, block):
-                part = slice(k, min(k + block, u.size))
-                yield ScenarioBlock(
-                    first=first + k,
-                    time_s=time[part],
-                    signals=MappingProxyType({name: x[part] for name, x in signals.items()}),
-                    truth=MappingProxyType({name: x[part] for name, x in stretch.truth.items()}),
-                )
