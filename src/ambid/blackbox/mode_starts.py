@@ -51,40 +51,25 @@ class Spectra:
 
 
 def spectra(data: IOData, band: tuple[float, float] | None) -> Spectra:
-    """Return the spectra of a record in a band, by default that of its inputs."""
-    f, (low, high), (U, Y) = lines_in_band(data, (data.u, data.y), band, _LEAST_LINES, "modes")
+    """Return the spectra of a record in a band in Hz, by default that of its inputs."""
+    n = data.n_samples
+    U, Y = (np.fft.rfft(x - x.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for x in (data.u, data.y))
+    f = np.arange(1, U.shape[0] + 1) * (1.0 / data.dt / n)
+    low, high = excited_band(U, f) if band is None else band
+    keep = (f >= low) & (f <= high)
+    if np.count_nonzero(keep) < _LEAST_LINES:
+        raise EstimationError(
+            f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; modes want {_LEAST_LINES}. "
+            f"Use a longer record or a wider {setting('band')}"
+        )
+    f, U, Y = f[keep], U[keep], Y[keep]
     silent = [name for name, x in zip(data.inputs, U.T, strict=True) if not np.any(x)]
     if silent:
         raise EstimationError(f"input {silent[0]!r} does not move between {low:g} and {high:g} Hz. Omit it")
     size = np.sqrt(np.mean(np.abs(U) ** 2, axis=0))
     columns = np.hstack([np.full((f.size, 1), 1.0 + 0j), U / size])
-    step = 2 * np.pi / data.dt / data.n_samples
+    step = 2 * np.pi / data.dt / n
     return Spectra(omega=2 * np.pi * f, U=columns, Y=Y, variance=_local_noise(columns, Y), step=step)
-
-
-def lines_in_band(
-    data: IOData, signals: Sequence[Array], band: tuple[float, float] | None, least: int, what: str
-) -> tuple[Array, tuple[float, float], list[Complex]]:
-    """Return the frequencies of the lines in a band in Hz (by default the first signals'), the band, and spectra
-    (n_lines, n) there; refuse fewer than `least` lines, which `what` needs.
-    """
-    n = data.y.shape[0]
-    spectra = [np.fft.rfft(x - x.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for x in signals]
-    f = np.arange(1, spectra[0].shape[0] + 1) * (1.0 / data.dt / n)
-    low, high = excited_band(spectra[0], f) if band is None else band
-    keep = (f >= low) & (f <= high)
-    if np.count_nonzero(keep) < least:
-        raise EstimationError(
-            f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; {what} want {least}. Use a "
-            f"longer record or a wider {setting('band')}"
-        )
-    return f[keep], (low, high), [x[keep] for x in spectra]
-
-
-def light_poles(order: int, p: Complex, shapes: Complex, low: float, high: float) -> list[TrialPole]:
-    """Return the poles that are lightly damped and lie from `low` to below `high`, rad/s."""
-    use = (p.real < 0) & (-p.real < 2 * MOST_DAMPED * np.abs(p)) & (p.imag >= low) & (p.imag < high)
-    return trial_poles(order, p[use], shapes[use])
 
 
 def excited_band(U: Complex, frequency_hz: Array) -> tuple[float, float]:
@@ -142,7 +127,7 @@ def conjugate(x: Complex) -> Complex:
 def starting_poles(lines: Spectra, say: Callable[[float], None]) -> tuple[list[complex], list[TrialPole]]:
     """Return poles that stay as the order grows, band by band, and all that were tried."""
     stable, tried, n = list[complex](), list[TrialPole](), lines.omega.size
-    for first, last, begin, end in overlapping_bands(lines.omega, lines.step):
+    for first, last, begin, end in _overlapping_bands(lines.omega, lines.step):
         low, high = lines.omega[begin], lines.omega[end - 1] + lines.step
         poles = _followed_poles(lines.part(first, last))
         tried += [p for p in poles[0] if low <= p.pole.imag < high]
@@ -164,15 +149,13 @@ def averaged_responses(lines: Spectra) -> Iterator[Spectra]:
         width *= 4
 
 
-def overlapping_bands(
-    omega: Array, step: float, lines: int = _BAND_LINES, share: float = _BAND_SHARE
-) -> Iterator[tuple[int, int, int, int]]:
+def _overlapping_bands(omega: Array, step: float) -> Iterator[tuple[int, int, int, int]]:
     """Yield first and last line of bands that overlap by half, and of the part of each that counts: these follow on
-    each other. `lines`, `share`: lines, and part of its frequency, that a band has at least.
+    each other.
     """
     first, begin, n = 0, 0, omega.size
     while True:
-        size = max(lines, int(share * omega[first] / step))
+        size = max(_BAND_LINES, int(_BAND_SHARE * omega[first] / step))
         last = min(first + size, n)
         if n - last < size // 4:
             last = n
@@ -189,8 +172,12 @@ def _followed_poles(lines: Spectra) -> tuple[list[TrialPole], list[complex]]:
     most = min(_ORDERS[1], int(0.5 * n_lines / columns) - 1)
     models = list(range(_ORDERS[0], most + 1, 2))
     low, high = np.nextafter(lines.omega[0], np.inf), lines.omega[-1]
-    rows = [light_poles(*trial, low, high) for trial in _common_denominators(lines, models)]
-    poles = followed(rows, _NEAR)
+
+    def light(order: int, p: Complex, shapes: Complex) -> list[TrialPole]:
+        use = (p.real < 0) & (-p.real < 2 * MOST_DAMPED * np.abs(p)) & (p.imag >= low) & (p.imag < high)
+        return trial_poles(order, p[use], shapes[use])
+
+    poles = followed([light(*trial) for trial in _common_denominators(lines, models)], _NEAR)
     return poles, [c.pole for c in clusters(poles, models, _NEAR)]
 
 
