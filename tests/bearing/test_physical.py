@@ -302,7 +302,7 @@ def identified(name, n, seed, structure, orders):
      ("bearing", 20_000, ("c",), "sspem", {"n": 4}),
      ("falling rotor", 8000, ("m", "c"), "sspem", {"n": 3}),
      ("falling rotor", 8000, ("m", "c"), "armax", {"na": 2, "nb": 2, "nc": 2, "nk": 2}),
-     ("coil", 5000, (), "srivc", {"nb": 1, "nf": 1, "nk": 0})],
+     ("coil", 5000, (), "armax", {"na": 1, "nb": 1, "nc": 1, "nk": 1})],
 )  # fmt: skip
 def test_black_box_and_grey_box_agree_on_the_same_record(name, n, fixed, structure, orders):
     bench, fit = identified(name, n, 0, structure, orders)

@@ -27,7 +27,6 @@ _OWN = {
     "bj": {"nd": 2},
     "ararx": {"nd": 5},
     "arma": {},
-    "srivc": {"nk": 0},  # what is sampled with a hold comes a sample later
     "clsrivc": {"nk": 0},
     "blocks": {"nk": 0},
 }

@@ -70,14 +70,6 @@ def test_a_delay_may_be_left_open_in_two_ways() -> None:
     assert not left_open({"nk": 0}, "nk")
 
 
-def test_a_refinement_finds_its_delay_where_the_caller_says_auto() -> None:
-    s = STRUCTURES["srivc"]
-    data = systems.open_loop(inputs=True)
-    rest = {k: v for k, v in usual(s).items() if k != "nk"}
-    one, other = s.estimator(data, rest), s.estimator(data, {**rest, "nk": "auto"})
-    np.testing.assert_array_equal(one.model.theta, other.model.theta)
-
-
 def test_numbers_are_spread_over_inputs_and_shown_as_one_where_they_agree() -> None:
     assert order_per_input("arx", {"nb": 2}, "nb", 1, 3) == (2, 2, 2)
     assert order_per_input("arx", {"nb": (1, np.int64(2))}, "nb", 1, 2) == (1, 2)  # type: ignore[dict-item]

@@ -145,62 +145,6 @@ def companion(den: Numbers) -> Numbers:
     return out
 
 
-def filter_states(den: Array, step: float, x: Array) -> Array:
-    """Return p^k/F(p) x, (n_samples, n), x straight between samples, from rest; `step`: sampling interval in 1/w0."""
-    from scipy.linalg import expm
-
-    n = den.size - 1
-    M = np.zeros((n + 2, n + 2))
-    M[:n, :n] = companion(den) * step
-    M[n - 1, n] = step
-    M[n, n + 1] = 1.0
-    E = expm(M)
-    z = np.stack([x, np.append(np.diff(x), 0.0)], axis=1)
-    return run_states(E[:n, :n], E[:n, n:], z)
-
-
-def free_response(den: Array, step: float, n_samples: int) -> Array:
-    """Return n responses (n_samples, n) of 1/F(p) without input that span all; `step`: sampling interval in 1/w0."""
-    from scipy.linalg import expm
-
-    n = den.size - 1
-    transition = expm(companion(den) * step)
-    first = np.zeros(n)
-    first[0] = 1.0
-    return run_states(transition.T, np.empty((n, 0)), np.empty((n_samples, 0)), first)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Responses:
-    """What one denominator makes of its inputs."""
-
-    y: Array  # (n_samples,), sum of B_i/F u_i
-    of_inputs: Array  # (n_samples, n_inputs, n), p^k/F u_i
-    of_output: Array  # (n_samples, n), p^k/F y
-
-
-def responses(den: Array, num: Array, step: float, u: Array) -> Responses:
-    """Simulate B_i/F u_i and its derivatives by the coefficients, inputs held over a sample, from rest; `num`:
-    (n_inputs, n + 1), highest power first; `step`: sampling interval in units of 1/w0.
-    """
-    from ambid.physics.linear_model import zero_order_hold
-
-    n, n_u = den.size - 1, u.shape[1]
-    size = n * (n_u + 1)
-    A, B, F = np.zeros((size, size)), np.zeros((size, n_u)), companion(den)
-    c = num[:, :0:-1] - num[:, :1] * den[:0:-1]  # output from the states p^0 ... p^(n-1) of each input
-    for i in range(n_u):
-        A[i * n : (i + 1) * n, i * n : (i + 1) * n] = F
-        B[(i + 1) * n - 1, i] = 1.0
-        A[-1, i * n : (i + 1) * n] = c[i]
-        B[-1, i] = num[i, 0]
-    A[-n:, -n:] = F
-    states = run_states(*zero_order_hold(A, B, step), u)
-    of_inputs = states[:, :-n].reshape(-1, n_u, n)
-    y = np.einsum("tik,ik->t", of_inputs, c) + u @ num[:, 0]
-    return Responses(y=y, of_inputs=of_inputs, of_output=states[:, -n:])
-
-
 Indices = NDArray[np.intp]
 
 _BLOCK = 4096  # samples at once

@@ -279,7 +279,7 @@ def test_the_tangent_of_a_state_space_holds_the_change_of_every_entry():
 
 def by_hand(model, data) -> BlackBoxFit:
     return build_fit(
-        "n4sid" if isinstance(model, StateSpaceModel) else "srivc",
+        "n4sid" if isinstance(model, StateSpaceModel) else "clsrivc",
         data,
         orders={"n": 2},
         model=model,
