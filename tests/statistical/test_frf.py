@@ -44,17 +44,6 @@ def h1(rng):
     return frf_random(u, lfilter(B, A, u) + 0.5 * rng.standard_normal(4096), 1.0, segment=256)
 
 
-def h2(rng):
-    u = rng.standard_normal(4096)
-    return frf_random(u + 0.5 * rng.standard_normal(4096), lfilter(B, A, u), 1.0, segment=256, kind="h2")
-
-
-def hv(rng):
-    u = rng.standard_normal(4096)
-    y = lfilter(B, A, u) + 0.2 * rng.standard_normal(4096)
-    return frf_random(u + 0.3 * rng.standard_normal(4096), y, 1.0, segment=256, kind="hv", noise_ratio=2.25)
-
-
 def welch_with_reference(rng):
     r = rng.standard_normal(16384)
     u, y = Loop().run(r, 0.1 * rng.standard_normal(16384))
@@ -86,8 +75,6 @@ def runs(estimate):
         (periodic_realisations, (B, A)),
         (periodic_with_reference, (Loop.b, Loop.a)),
         (h1, (B, A)),
-        (h2, (B, A)),
-        (hv, (B, A)),
         (welch_with_reference, (Loop.b, Loop.a)),
         (local, (B, A)),
         (local_with_reference, (Loop.b, Loop.a)),

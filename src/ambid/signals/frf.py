@@ -231,7 +231,6 @@ def _smooth(bad: np.ndarray, frequency: Array) -> str:
     )
 
 
-Kind = Literal["h1", "h2", "hv"]
 _Found = tuple[Complex, Complex, Array, str]  # G, covariance, coherence, method
 _LEAKAGE_FROM = 32  # shortest segment that is compared with its half
 _EDGE = 2  # lines at 0 and at half the rate whose window reaches over the end, where errors are not circular
@@ -243,30 +242,20 @@ def frf_random(
     rate_hz: float,
     *,
     r: Array | None = None,
-    kind: Kind = "h1",
     segment: int | None = None,
-    noise_ratio: float | None = None,
     open_loop: bool = False,
     hold: Hold = "zoh",
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> FrequencyResponse:
-    """Estimate the frequency response by Welch's averages: G = S_yu S_uu⁻¹ (H1: noise at the output), S_yy S_uy⁻¹ (H2:
-    at the input), total least squares (Hv: both), or S_yr S_ur⁻¹ with a reference, which feedback does not bias.
+    """Estimate the frequency response by Welch's averages: G = S_yu S_uu⁻¹ (H1: noise at the output), or S_yr
+    S_ur⁻¹ with a reference, which feedback does not bias.
 
     Variance (1 - γ²)/γ² |G|²/n of n independent averages (Bendat and Piersol 2010, sec. 9.2), n reduced for overlap
     (Welch 1967); of several inputs S_vv ⊗ S_uu⁻ᵀ/n. Leakage is not in it, but looked for by halving segments.
     """
     u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
-    if kind not in ("h1", "h2", "hv"):
-        raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'. Give one of them")
-    if r is not None and kind != "h1":
-        raise EstimationError(f"kind {kind!r} with a reference, which replaces it. Omit one of the two")
-    if noise_ratio is not None and (kind != "hv" or not noise_ratio > 0.0):
-        raise EstimationError(
-            f"noise_ratio {noise_ratio} with kind {kind!r}; it must be positive, for 'hv'. Correct it"
-        )
     z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)
     spectra = cross_spectra(z, rate_hz, segment=segment)
     n_y, n_u, n_x = y.shape[1], u.shape[1], (u if r is None else r).shape[1]
@@ -275,15 +264,13 @@ def frf_random(
             f"{spectra.n_segments} segments, worth {spectra.n_effective:.1f} averages, with {n_x} inputs or "
             f"references; more than {n_x + 1} averages are needed. Use a longer record, or shorter segments"
         )
-    estimate, warnings = _found(spectra, n_y, n_u, kind, noise_ratio)
-    if r is None:
-        warnings += () if open_loop else (f"{kind.upper()}: {feedback_caution()}",)
-        if kind == "hv" and noise_ratio is None:
-            warnings += ("Hv assumes the same noise share of input and output at every line. Give noise_ratio",)
+    estimate, warnings = _found(spectra, n_y, n_u)
+    if r is None and not open_loop:
+        warnings += (f"H1: {feedback_caution()}",)
     length = round(rate_hz / spectra.frequency_hz[1])
     if length % 2 == 0 and length >= _LEAKAGE_FROM:
         half = cross_spectra(z, rate_hz, segment=length // 2)
-        warnings += _leakage(estimate, _found(half, n_y, n_u, kind, noise_ratio)[0], 2.0 * (spectra.n_effective - n_x))
+        warnings += _leakage(estimate, _found(half, n_y, n_u)[0], 2.0 * (spectra.n_effective - n_x))
     G, covariance, coherence, method = estimate
     return FrequencyResponse(
         frequency_hz=spectra.frequency_hz[_EDGE:-_EDGE],
@@ -309,9 +296,7 @@ def frf_random(
     )
 
 
-def _found(
-    spectra: CrossSpectra, n_y: int, n_u: int, kind: str, noise_ratio: float | None
-) -> tuple[_Found, tuple[str, ...]]:
+def _found(spectra: CrossSpectra, n_y: int, n_u: int) -> tuple[_Found, tuple[str, ...]]:
     S, n = spectra.density[_EDGE:-_EDGE], spectra.n_effective
     if S.shape[1] > n_y + n_u:
         n_z = n_y + n_u
@@ -322,7 +307,10 @@ def _found(
         coherence = _explained(noise, S, n_y, n, S_rr.shape[1])
         estimate = (G, C, coherence, "joint input-output with the reference (Welch)")
         return estimate, weak_inputs(Z, covariance, n_y)
-    return _by_kind(S, n_y, n_u, kind, n, noise_ratio), ()
+    S_yy, S_yu, S_uu = S[:, :n_y, :n_y], S[:, :n_y, n_y:], S[:, n_y:, n_y:]
+    _told_apart(S_uu)
+    G, covariance, noise = _regressed(S_yy, S_yu, S_uu, n)
+    return (G, covariance, _explained(noise, S, n_y, n, n_u), "H1 (Welch)"), ()
 
 
 def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
@@ -345,28 +333,6 @@ def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
     )
 
 
-def _by_kind(S: Complex, n_y: int, n_u: int, kind: str, n: float, noise_ratio: float | None) -> _Found:
-    n_z = n_y + n_u
-    S_yy, S_yu, S_uu = S[:, :n_y, :n_y], S[:, :n_y, n_y:], S[:, n_y:, n_y:]
-    _told_apart(S_uu)
-    G, covariance, noise = _regressed(S_yy, S_yu, S_uu, n)
-    coherence = _explained(noise, S, n_y, n, n_u)
-    if kind == "h1":
-        return G, covariance, coherence, "H1 (Welch)"
-    if kind == "h2":
-        if n_y != n_u:
-            raise EstimationError(f"H2 with {n_y} outputs and {n_u} inputs; it needs as many. Use kind='h1' or 'hv'")
-        _told_apart(S_yy)
-        # H2 is the inverse of H1 with inputs and outputs exchanged: G = F⁻¹, dG = -G dF G.
-        F, C, _ = _regressed(S_uu, np.conj(np.swapaxes(S_yu, 1, 2)), S_yy, n)
-        _told_apart(F)
-        Z = np.concatenate([np.broadcast_to(np.eye(n_y, dtype=complex), F.shape), F], axis=1)
-        joint = np.zeros((S.shape[0], n_z * n_y, n_z * n_y), dtype=complex)
-        joint[:, n_y * n_y :, n_y * n_y :] = C
-        return (*ratio(Z, joint, n_y), coherence, "H2 (Welch)")
-    return (*_total_least_squares(S_yy, S_yu, S_uu, n, noise_ratio), coherence, "Hv (Welch)")
-
-
 def _regressed(S_zz: Complex, S_zx: Complex, S_xx: Complex, n: float) -> tuple[Complex, Complex, Complex]:
     """Return S_zx S_xx⁻¹, its covariance, and the noise S_vv with the degrees of freedom of the fit taken off."""
     n_x = S_xx.shape[1]
@@ -385,41 +351,6 @@ def _explained(noise: Complex, S: Complex, n_y: int, n: float, n_x: int) -> Arra
     return np.asarray(np.clip(1.0 - share, 0.0, 1.0))  # round-off only: S is positive semidefinite
 
 
-def _total_least_squares(
-    S_yy: Complex, S_yu: Complex, S_uu: Complex, n: float, noise_ratio: float | None
-) -> tuple[Complex, Complex]:
-    """Return G and its covariance from the smallest eigenvector of each output's joint spectrum with the inputs.
-
-    With noise covariance D on [y, u] and w = [1, -G], the smallest eigenvalue is the noise level, and to first order
-    dG = Σ_segments (w·z)(x̂ᴴ)/n S₀⁻¹, where S₀ = S_uu - λ D_u is the spectrum without noise (Van Huffel and Vandewalle
-    1991, sec. 8.5). Outputs are fitted one by one; between them the covariance is left at 0.
-    """
-    n_f, n_y, n_u = S_yu.shape
-    G = np.empty((n_f, n_y, n_u), dtype=complex)
-    C = np.zeros((n_f, n_y * n_u, n_y * n_u), dtype=complex)
-    for i in range(n_y):
-        joint = np.empty((n_f, 1 + n_u, 1 + n_u), dtype=complex)
-        joint[:, 0, 0], joint[:, 0, 1:], joint[:, 1:, 0] = S_yy[:, i, i], S_yu[:, i], S_yu[:, i].conj()
-        joint[:, 1:, 1:] = S_uu
-        power = np.real(np.diagonal(joint, axis1=1, axis2=2))
-        D = power if noise_ratio is None else np.broadcast_to(np.r_[1.0, np.full(n_u, noise_ratio)], power.shape)
-        root = np.sqrt(D)
-        level, vector = np.linalg.eigh(joint / root[:, :, None] / root[:, None, :])
-        w = vector[:, :, 0].conj() / root  # w·z is what the fit leaves
-        G[:, i] = -w[:, 1:] / w[:, :1]
-        S_0 = S_uu - level[:, 0, None, None] * D[:, 1:, None] * np.eye(n_u)
-        noise = level[:, 0] * (D[:, 0] + np.sum(np.abs(G[:, i]) ** 2 * D[:, 1:], axis=1)) * n / (n - n_u)
-        inverse = np.linalg.inv(S_0)
-        # E|v|² S_0⁻¹ (S_0 + what is left of the input noise) S_0⁻¹; the second part is what H1 has not.
-        a = G[:, i].conj() * D[:, 1:] * level[:, :1]
-        left = level[:, 0, None, None] * D[:, 1:, None] * np.eye(n_u)
-        left = left - a[:, :, None] * a[:, None, :].conj() / (noise * (n - n_u) / n)[:, None, None]
-        B = inverse + inverse @ left @ inverse
-        block = slice(i * n_u, (i + 1) * n_u)
-        C[:, block, block] = noise[:, None, None] * np.swapaxes(B, 1, 2) / n
-    return G, C
-
-
 def _told_apart(S: Complex) -> None:
     scale = np.sqrt(np.abs(np.diagonal(S, axis1=1, axis2=2)))
     if not np.all(scale > 0):
@@ -427,7 +358,7 @@ def _told_apart(S: Complex) -> None:
     worst = float(np.max(np.linalg.cond(S / scale[:, :, None] / scale[:, None, :])))
     if worst > 1e10:
         raise EstimationError(
-            f"the spectra of the inputs (or outputs, for H2) are dependent, condition {worst:.1e}; below 1e10 is "
+            f"the spectra of the inputs are dependent, condition {worst:.1e}; below 1e10 is "
             "needed. Excite each input independently, or omit one"
         )
 
@@ -461,9 +392,8 @@ def frequency_response(
         All methods: `open_loop` (the record is known to be open loop), `hold` ("zoh" or "band-limited", what the input
         does between samples), and `inputs`, `outputs`, `units` (names, and SI unit by name). Local: `free` (least lines
         of a window beyond its unknowns), `band` in Hz, `leave_out` (lines at which the excitation does not tell G from
-        leakage are left out instead of refused). Random: `kind` ("h1", "h2", "hv": where the noise is), `segment` in
-        samples, `noise_ratio` (for "hv", of input over output noise). Periodic: `period` in samples, `lines` that are
-        excited, `drop_periods` (a number, or "auto") that hold a transient.
+        leakage are left out instead of refused). Random: `segment` in samples. Periodic: `period` in samples, `lines`
+        that are excited, `drop_periods` (a number, or "auto") that hold a transient.
 
     Returns
     -------
