@@ -572,7 +572,7 @@ def followed(**changes):
         ({"lines": (SimpleNamespace(error=1.6, state="tracking"),)}, "the model error is 1.6 at the end, beyond 1.5"),
         ({"lines": (SimpleNamespace(error=float("nan"), state="frozen"),)}, "the model error is nan"),
         ({"lines": ()}, "no line of the track came"),
-        ({"overruns": 3}, "3 blocks found the ring full"),
+        ({"overruns": 3}, "3 blocks found the queue full"),
         ({"run": replace(WHOLE, samples=90, lost=10)}, "10 of 100 samples were lost during tracking"),
     ],
     ids=["good", "error", "unknown", "empty", "slow", "lost"],

@@ -45,6 +45,7 @@ class DeviceInfo:
     identity: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
     # of an emulated or simulated bench: its linear parameters, SI; empty where nobody knows them
     plant: Mapping[str, float] = field(default_factory=dict)
+    real: bool = True  # whether its time runs with the host's; else it goes as fast as possible
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -27,6 +28,7 @@ _EVERY_S = 0.048  # between two frames, a little less than the 50 ms that five b
 _SPECTRUM_S = 1.0  # of samples a spectrum is made of, and between two of them
 _LINES = 400  # of a spectrum
 _INSIDE_S = 1.0  # after which a limit that is passed is told again
+_TINY = 1e-290  # what is smaller is shown as zero
 _HEAD = struct.Struct("<QQIHHdd")  # first sample, samples lost, envelopes, channels, samples of each, end s, wall clock
 
 
@@ -187,6 +189,7 @@ WINDOWS: Mapping[str, tuple[tuple[float, ...], float]] = {
 Hann's, 0.1 % with the flat top: D'Antona, Ferrero (2006), Digital Signal Processing for Measurement Systems."""
 
 
+@lru_cache(maxsize=2)
 def window(n: int, weights: str = "Hann") -> Array:
     """Return a window (n,) over whole periods."""
     phase = 2.0 * np.pi * np.arange(n) / n
@@ -215,7 +218,12 @@ def spectrum(
 
 def rounded(values: Array, digits: int = 5) -> list[float | None]:
     """Return numbers to some digits for JSON; None where not finite."""
-    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+    x = np.asarray(values, dtype=float)
+    with np.errstate(all="ignore"):
+        places = digits - 1 - np.floor(np.log10(np.maximum(np.abs(x), _TINY)))
+        size = 10.0 ** np.abs(places)
+        x = np.where(places < 0, np.round(x / size) * size, np.round(x * size) / size)
+    return [v if np.isfinite(v) else None for v in x.tolist()]
 
 
 def throttled(every_s: float, tell: Callable[..., object]) -> Callable[..., object]:

@@ -544,7 +544,7 @@ def tracking(done: LiveTrack, limit: float) -> Step:
             f"the model error is {last.error:.3g} at the end, beyond {limit:g}: the bench is another one now"
         )
     if done.overruns:
-        reasons.append(f"{done.overruns} blocks found the ring full: the machine is too busy to track this rate")
+        reasons.append(f"{done.overruns} blocks found the queue full: the machine is too busy to track this rate")
     return Step(
         name="track", findings=tuple(findings), reasons=tuple(reasons), numbers={"error": last.error, "limit": limit}
     )

@@ -1,4 +1,4 @@
-"""Live tracking: a device in its own thread fills a ring, the tracker follows; nothing on the data's way waits for it.
+"""Live tracking: a device in its own thread fills a queue, the tracker follows; nothing on the data's way waits for it.
 An identification, or a check of the start, takes the stream's beginning, which is then tracked like the rest.
 """
 
@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import ceil
 from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
@@ -18,6 +17,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ambid.acquisition.device import AxesProgram, Device, DeviceEvent
+from ambid.acquisition.devices.played import FrameQueue
 from ambid.acquisition.session import Course, RunReport, Tap, run
 from ambid.acquisition.settings import BenchView, fault_words
 from ambid.arrays import Array
@@ -33,11 +33,9 @@ from ambid.rig.load import SELECTED
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import find_excitation
 from ambid.tracking.blocks import Block, Frame, Replay
-from ambid.tracking.ring import BlockRing
 
-_BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided
-_QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, or the machine is busy
-_BLOCKS_PER_S = 250  # that a port gives at most, however few samples each of them holds
+_BLOCK_SAMPLES = 256  # of the blocks in which what was read for the start is tracked
+_QUEUE_S = 30.0  # of samples that wait while a start is identified, or the machine is busy
 _CHECKED_S = 0.5  # of the stream that a given start is checked with
 _IDENTIFIED_S, _IDENTIFIED_SAMPLES = 2.0, 10_000  # at least, where a start is to be identified
 
@@ -54,7 +52,7 @@ class LiveTrack:
 
     track: Track  # header, lines where they were kept, summary
     run: RunReport  # of the device
-    overruns: int  # blocks that found the ring full: they are gaps in the track, and counted there too
+    overruns: int  # blocks that found the queue full: they are gaps in the track, and counted there too
 
 
 def track_live(
@@ -92,35 +90,36 @@ def track_live(
             f"tracking needs {wanted_s:g} s for its start, and the run lasts {course.seconds:g} s. Run longer"
             + (", or give a start" if wanted_s == start else "")
         )
-    slots = max(64, ceil(_QUEUE_S * (_BLOCKS_PER_S + view.rate_hz / _BLOCK_SAMPLES)))
-    with BlockRing.create(
-        rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
-    ) as ring:
-        ring_tap = RingTap(ring, view, waits=device.info.kind != "serial", stopped=stopped)
-        job = partial(run, device, course, taps=(*taps, ring_tap), on_event=on_event)  # who records is never behind
-        runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
-        with runner:
-            lead = _Lead(_frames(ring, ring_tap.fresh), runner, wanted_s, view, device.info.port)
-            if rig.rotor is not None:
-                from ambid.job.track_rotor import follow_rotor
+    queue = FrameQueue(max(1, round(_QUEUE_S * view.rate_hz)))
+    queue.begin()
+    tap = QueueTap(queue, view, waits=device.info.kind != "serial", stopped=stopped)
+    job = partial(run, device, course, taps=(*taps, tap), on_event=on_event)  # who records is never behind
+    runner = LiveRun(job, tap, queue, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
+    with runner:
+        lead = _Lead(_frames(queue, real=device.info.real), runner, wanted_s, view, device.info.port)
+        if rig.rotor is not None:
+            from ambid.job.track_rotor import follow_rotor
 
-                known = isinstance(course.program, AxesProgram) or isinstance(start, (int, float))
-                sought_s = 0.0 if known else min(course.seconds / 3.0, _SOUGHT_S)
-                source, how = lead.periodic(rig, sought_s), Following(**following)
-                frames = lead.frames(None, 0, lambda _: None)
+            known = isinstance(course.program, AxesProgram) or isinstance(start, (int, float))
+            sought_s = 0.0 if known else min(course.seconds / 3.0, _SOUGHT_S)
+            source, how = lead.periodic(rig, sought_s), Following(**following)
+            frames = lead.frames(None, 0, lambda _: None)
 
-                def say(_: str, __: float | None = None, /) -> None:  # between steps of a start's identification
-                    if stopped():
-                        raise DeviceError("the run was stopped while its start was identified: nothing was tracked")
+            def say(_: str, __: float | None = None, /) -> None:  # between steps of a start's identification
+                if stopped():
+                    raise DeviceError("the run was stopped while its start was identified: nothing was tracked")
 
-                track = follow_rotor(source, frames, rig, start, how, on_lag=on_lag, on_loop=on_loop, say=say)
-            else:
-                assert not isinstance(start, RotorEstimate)
-                source = lead.source
-                begin = start_of(source, rig, start=start, rig_speaks=True)
-                frames = lead.frames(source, begin.first, on_lag)
-                track = follow(frames, source, begin, Following(**following), live=True)
-        return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
+            track = follow_rotor(source, frames, rig, start, how, on_lag=on_lag, on_loop=on_loop, say=say)
+        else:
+            assert not isinstance(start, RotorEstimate)
+            source = lead.source
+            begin = start_of(source, rig, start=start, rig_speaks=True)
+            frames = lead.frames(source, begin.first, on_lag)
+            track = follow(frames, source, begin, Following(**following), live=True)
+    if queue.overruns and track.totals is not None and track.totals.latency is not None:
+        latency = replace(track.totals.latency, overruns=queue.overruns)
+        track = replace(track, totals=replace(track.totals, latency=latency))
+    return LiveTrack(track=track, run=runner.report(), overruns=queue.overruns)
 
 
 def _rotor_start_s(course: Course, start: object, rate_hz: float) -> float:
@@ -194,17 +193,16 @@ class _Lead:
             on_lag(time.perf_counter() - frame.arrived_s)
 
 
-def _frames(ring: BlockRing, fresh: Signal) -> Iterator[Frame]:
-    """Yield the frames of a ring until it has ended and is empty; `fresh` is set with each block: nothing polls."""
+def _frames(queue: FrameQueue, *, real: bool) -> Iterator[Frame]:
+    """Yield the frames of a queue until its end; of a device whose time is not the host's, as come when they are asked
+    for.
+    """
     while True:
-        frame = ring.read(0.0)
+        frame = queue.take(LOOK_S)
         if frame is not None:
-            yield frame
-        elif ring.ended:
+            yield frame if real else replace(frame, arrived_s=time.perf_counter())
+        elif queue.ended:
             return
-        else:
-            fresh.wait(LOOK_S)
-            fresh.clear()
 
 
 def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
@@ -220,31 +218,28 @@ def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
     )
 
 
-class RingTap:
-    """Puts what a device samples into the ring, by the rig's `view`, numbered from its first sample, uncovered by
-    calibration as NaN, rejected and counted. A real bench waits for nobody, and blocks lost to a full ring are counted;
-    one that is only played is held up (`waits`) until it is `stopped`. `over`: set when nobody reads; `fresh`: when a
-    block is put in.
+class QueueTap:
+    """Puts what a device samples into a queue, by the rig's `view`, numbered from its first sample, uncovered by
+    calibration as NaN, rejected and counted. A real bench waits for nobody, and blocks lost to a full queue are
+    counted; one that is only played is held up (`waits`) until it is `stopped`. `over`: set when nobody reads.
     """
 
     def __init__(
-        self, ring: BlockRing, view: BenchView, *, waits: bool, stopped: Callable[[], bool] = lambda: False
+        self, queue: FrameQueue, view: BenchView, *, waits: bool, stopped: Callable[[], bool] = lambda: False
     ) -> None:
-        self._ring, self._view, self._waits, self._stopped = ring, view, waits, stopped
+        self._queue, self._view, self._waits, self._stopped = queue, view, waits, stopped
         self._origin: int | None = None
-        self.over, self.fresh = Signal(), Signal()
+        self.over = Signal()
 
     def take(self, frame: Frame) -> None:
-        """Put a block into the ring. `frame`: as it came."""
+        """Put a block into the queue. `frame`: as it came."""
         block = self._seen(frame.block)
         if self._origin is None:
             self._origin = block.first
-        while self._waits and not (self.over.is_set() or self._stopped() or self._ring.wait_for_room(LOOK_S)):
+        n = len(block.values)
+        while self._waits and not (self.over.is_set() or self._stopped() or self._queue.wait_for_room(n, LOOK_S)):
             pass
-        self._ring.put(
-            Block(first=block.first - self._origin, time_s=block.time_s, values=block.values), frame.arrived_s
-        )
-        self.fresh.set()
+        self._queue.put(replace(frame, block=replace(block, first=block.first - self._origin)))
 
     def _seen(self, raw: Block) -> Block:
         try:
@@ -260,22 +255,22 @@ class RingTap:
 
 
 class LiveRun:
-    """The run `job` of the device, in a thread of its own, ended with the context, as is the `ring`; `recorded`: it
-    goes on for others where tracking fails; `on_run`: given its result.
+    """The run `job` of the device, in a thread of its own, ended with the context, as is the `queue`; `recorded`:
+    it goes on for others where tracking fails; `on_run`: given its result.
     """
 
     def __init__(
         self,
         job: Callable[..., RunReport],
-        ring_tap: RingTap,
-        ring: BlockRing,
+        tap: QueueTap,
+        queue: FrameQueue,
         stopped: Callable[[], bool],
         *,
         recorded: bool,
         on_run: Callable[[RunReport], object] | None,
         on_trouble: Callable[[AmbidError], object] | None,
     ) -> None:
-        self._job, self._ring_tap, self._ring, self._recorded = job, ring_tap, ring, recorded
+        self._job, self._tap, self._queue, self._recorded = job, tap, queue, recorded
         self._on_run, self._on_trouble = on_run, on_trouble
         self._stopped, self._stop = stopped, Signal()
         self._report: RunReport | None = None
@@ -287,7 +282,7 @@ class LiveRun:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self._ring_tap.over.set()
+        self._tap.over.set()
         try:
             if isinstance(error, AmbidError) and self._recorded and self._thread.is_alive():
                 if self._on_trouble is not None:
@@ -314,5 +309,4 @@ class LiveRun:
         except BaseException as failure:
             self._failure = failure
         finally:
-            self._ring.end()
-            self._ring_tap.fresh.set()
+            self._queue.end()

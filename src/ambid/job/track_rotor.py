@@ -6,7 +6,7 @@ Read -> start (an estimate, or one identified from the first periods) -> filter 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Experiment, Point, noise_weight
 from ambid.rotor.spectra import Excitation, PeriodSpectra, find_excitation, period_spectra
-from ambid.rotor.synchronous import rotation_of, separate, synchronous_response, without_synchronous
+from ambid.rotor.synchronous import rotation_of, separate, synchronous_response
 from ambid.rotor.unknowns import Unknowns
 from ambid.settings.caller import saved, setting
 from ambid.tracking.blocks import Block as Samples
@@ -213,16 +213,14 @@ def _spectra_of(window: Record, model: RotorModel, whole: Experiment, size: int)
     """
     spectra, run = whole.spectra, Excitation(period=whole.spectra.period, first=0, count=size + 1)
     rotation = rotation_of(window, replace(model, speed=whole.speed), run) if whole.speed else None
-    if rotation is not None:
-        roles = (*model.inputs, *model.outputs)
-        window = without_synchronous(window, synchronous_response(window, roles, rotation, run))
+    roles, n = (*model.inputs, *model.outputs), len(model.inputs)
+    if rotation is None:
+        x = np.column_stack([window[role].values for role in roles])
+    else:
+        x = synchronous_response(window, roles, rotation, run).left
     bins = np.round(spectra.frequency_hz * run.period / window.rate_hz).astype(int)
-
-    def of(roles: Sequence[str]) -> Complex:
-        x = np.column_stack([window[role].values[run.period :] for role in roles])
-        return np.asarray(np.fft.rfft(x.reshape(size, run.period, -1), axis=1)[:, bins] / run.period)
-
-    return of(model.inputs), of(model.outputs)
+    found = np.fft.rfft(x[run.period :].reshape(size, run.period, -1), axis=1)[:, bins] / run.period
+    return found[..., :n], found[..., n:]
 
 
 class _Judge:

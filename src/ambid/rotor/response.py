@@ -129,7 +129,7 @@ class Sampled:
         right = inverse @ self.space.B
         gap = s[:, None] - s[None, :]
         same = np.abs(gap) <= _SAME * (np.abs(s[:, None]) + np.abs(s[None, :]))
-        gap = np.where(same, 1.0, gap)
+        per_gap, (i, j) = 1.0 / np.where(same, 1.0, gap), np.nonzero(same)
         weights = np.zeros((self.omega.size, n, n), dtype=complex)  # divided differences times the modal input
         modal = np.zeros((self.omega.size, n), dtype=complex)
         d_B = [inverse @ d.B for d in directions]
@@ -138,9 +138,11 @@ class Sampled:
             h = self.scalar(held, fraction)
             by_value, by_fraction = self.scalar_slopes(held, fraction)
             into = late[:, columns] @ right[:, columns].T
-            differences = (h[:, :, None] - h[:, None, :]) / gap
-            differences[:, same] = (0.5 * (by_value[:, :, None] + by_value[:, None, :]))[:, same]
-            weights += differences * into[:, None, :]
+            differences = h[:, :, None] - h[:, None, :]
+            differences *= per_gap
+            differences[:, i, j] = 0.5 * (by_value[:, i] + by_value[:, j])
+            differences *= into[:, None, :]
+            weights += differences
             modal += h * into
             for k, d in enumerate(d_B):
                 if np.any(d[:, columns]):
@@ -152,7 +154,7 @@ class Sampled:
         if len(directions):
             moved = np.matmul(weights.transpose(1, 0, 2), d_A.transpose(1, 2, 0))  # (n, n_lines, n_directions)
             through[:, :, : len(directions)] += moved.transpose(1, 0, 2)
-        slopes_of_response = np.tensordot(through, left, axes=(1, 1)).transpose(0, 2, 1)
+        slopes_of_response = left @ through
         x = modal @ V.T
         for k, direction in enumerate(directions):
             if np.any(direction.C):

@@ -4,6 +4,7 @@ angle(t)), by least squares on the whole used record with every line of a period
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -328,7 +329,8 @@ def synchronous_response(
     highest = max(1, min(_HARMONICS, int(_TOP * rate * 2.0 * np.pi / abs(rotation.speed))))
     orders = tuple(range(1, highest + 1))
     lines = _coincident(angle, orders, periods)
-    a, own, left = _amplitudes(y - y.mean(axis=0), [np.exp(1j * k * angle) for k in orders], lines, periods)
+    waves = list(itertools.accumulate([np.exp(1j * angle)] * highest, np.multiply))  # of 1, 2, ... a turn
+    a, own, left = _amplitudes(y - y.mean(axis=0), waves, lines, periods)
     return SynchronousResponse(
         roles=tuple(roles), rotation=rotation, orders=orders, amplitude=a,
         together=tuple(round(k * _turns(angle) / periods) in lines for k in orders),

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -407,17 +407,24 @@ def as_columns(record: Record, rig: Rig, setpoint: Array | None = None) -> Recor
     """Name the roles by the rig's columns and undo their calibrations, those first, then what has no role. `setpoint`
     (n_samples,), in m: the role ``reference`` of one axis.
     """
-    roles = {c.name: c for c in record.channels}
-    if setpoint is not None:
-        roles["reference"] = Channel(name="reference", unit="m", values=setpoint)
+    extra = () if setpoint is None else (Channel(name="reference", unit="m", values=setpoint),)
+    columns = MappingProxyType({c.role: c.column for c in rig.channels})
+    channels = column_channels(record.channels, rig, record.n_samples, extra)
+    return record.with_step(Step(name="uncalibrate", settings=columns), channels=channels)
+
+
+def column_channels(
+    channels: Sequence[Channel], rig: Rig, n_samples: int, extra: Sequence[Channel] = ()
+) -> tuple[Channel, ...]:
+    """Return channels named by role as the rig's columns, then those without a role but the `extra` ones."""
+    roles = {c.name: c for c in (*channels, *extra)}
     for name, unit in TURNING.items():
-        roles.setdefault(name, Channel(name=name, unit=unit, values=np.zeros(record.n_samples)))
+        if name not in roles:
+            roles[name] = Channel(name=name, unit=unit, values=np.zeros(n_samples))
     plant = rig.plant
     occupied = {c.role for c in rig.channels} | set(plant.inputs) | set(plant.outputs)
-    others = [c for c in record.channels if c.name not in occupied]
-    channels = tuple(_raw(roles[c.role], c) for c in rig.channels)
-    columns = MappingProxyType({c.role: c.column for c in rig.channels})
-    return record.with_step(Step(name="uncalibrate", settings=columns), channels=(*channels, *others))
+    others = [c for c in channels if c.name not in occupied]
+    return (*(_raw(roles[c.role], c) for c in rig.channels), *others)
 
 
 def _raw(channel: Channel, c: RigChannel) -> Channel:

@@ -433,7 +433,7 @@ class RotorBench:
             **dict.fromkeys(references, rotor.units[rotor.inputs[0]]),
         }
         order = sorted(values, key=lambda name: rotor.axes.index(name.split("_")[0]))  # an axis after the other
-        channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
+        channels = [Channel(name=name, unit=units[name], values=values[name]) for name in order]
         angle = moved.angle[settle:]
         if rotor.speed or "angle" in roles:  # of a rotor that turns; speed and tacho where the rig names them
             channels.append(Channel(name="angle", unit="rad", values=angle))

@@ -303,7 +303,8 @@ class LineDevice(ABC):
         self._rig, self._si, self._real, self._answer_s = rig, si, real, answer_s
         self._settings = controller_settings(rig)
         rate = self._settings.rate_hz
-        self._info = DeviceInfo(kind=kind, port=where, rate_hz=rate, columns=columns(rig, self._settings, si=si))
+        shown = columns(rig, self._settings, si=si)
+        self._info = DeviceInfo(kind=kind, port=where, rate_hz=rate, columns=shown, real=real)
         self._stream = self._new_stream()
         self._controller: Controller | None = None
         self._loaded: Program | None = None

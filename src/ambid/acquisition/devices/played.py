@@ -45,8 +45,8 @@ class FrameQueue:
     `overruns`: blocks dropped for want of room; `overrun_samples`: samples in them.
     """
 
-    def __init__(self) -> None:
-        self.room, self._held = ROOM, 0
+    def __init__(self, room: int = ROOM) -> None:
+        self.room, self._held = room, 0
         self._frames: deque[Frame] = deque()
         self._changed = threading.Condition()
         self._ended = True
@@ -62,7 +62,7 @@ class FrameQueue:
         """Append a frame, or count it as lost and return False."""
         n = len(frame.block.values)
         with self._changed:
-            if self._held + n > self.room:
+            if not self._fits(n):
                 self.overruns += 1
                 self.overrun_samples += n
                 return False
@@ -81,14 +81,24 @@ class FrameQueue:
     def take(self, timeout_s: float) -> Frame | None:
         """Return the next frame; None if none came within `timeout_s`, or at the end."""
         with self._changed:
-            self._changed.wait_for(lambda: self._frames or self._ended, timeout_s)
+            if timeout_s > 0.0:
+                self._changed.wait_for(lambda: self._frames or self._ended, timeout_s)
             if self._frames:
                 frame = self._frames.popleft()
                 self._held -= len(frame.block.values)
+                self._changed.notify_all()
                 return frame
             if self._failure is not None:
                 raise self._failure
             return None
+
+    def wait_for_room(self, n: int, timeout_s: float) -> bool:
+        """Wait until `n` samples fit: for a source that can; whether they do."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._fits(n), timeout_s)
+
+    def _fits(self, n: int) -> bool:
+        return not self._held or self._held + n <= self.room
 
     @property
     def held(self) -> int:
@@ -368,7 +378,9 @@ class ReplayDevice(PlayedDevice):
         )
         # A name of other bytes than UTF-8 cannot be written into a record as it is.
         port = os.fsencode(path).decode("utf-8", "replace")
-        self._info = DeviceInfo(kind="replay", port=port, rate_hz=record.rate_hz, columns=columns)
+        self._info = DeviceInfo(
+            kind="replay", port=port, rate_hz=record.rate_hz, columns=columns, real=pace == "real"
+        )  # fmt: skip
         self._row = self._base = 0
 
     def _opened(self) -> None:

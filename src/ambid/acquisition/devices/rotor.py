@@ -14,10 +14,10 @@ from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset
-from ambid.record import Record
+from ambid.record import Channel
 from ambid.rig.draft import rig_of_preset
 from ambid.rig.rig import Rig
-from ambid.simulation.rig_bench import as_columns
+from ambid.simulation.rig_bench import column_channels
 from ambid.simulation.rotor_bench import Motion, RotorBench
 from ambid.tracking.blocks import Block
 
@@ -48,11 +48,11 @@ class RotorDevice(PlayedDevice):
         shown = self._logged(self._off.advance(self._off.begun(), none, np.random.default_rng(0)), none)
         self._info = DeviceInfo(
             kind="simulated", port=truth.name or "rig", rate_hz=rate_hz, plant=self._levitated.plant.parameters,
-            columns=tuple(Column(name=c.name, role=roles.get(c.name, c.name), unit=c.unit) for c in shown.channels),
+            columns=tuple(Column(name=c.name, role=roles.get(c.name, c.name), unit=c.unit) for c in shown),
         )  # fmt: skip
 
-    def _logged(self, moved: Motion, u: Array) -> Record:
-        return as_columns(Record(rate_hz=self._rate, channels=self._off.channels(moved, u)), self._off.rig)
+    def _logged(self, moved: Motion, u: Array) -> tuple[Channel, ...]:
+        return column_channels(self._off.channels(moved, u), self._off.rig, len(u))
 
     def _opened(self) -> None:
         self._rng = np.random.default_rng(self._seed)
@@ -97,7 +97,7 @@ class RotorDevice(PlayedDevice):
             )
         if self._state == "levitating":
             self._watch(moved)
-        values = np.column_stack([c.values for c in self._logged(moved, u).channels])
+        values = np.column_stack([c.values for c in self._logged(moved, u)])
         return Block(first=self._next, time_s=self._next / self._rate, values=values)
 
     def _watch(self, moved: Motion) -> None:
@@ -105,6 +105,10 @@ class RotorDevice(PlayedDevice):
         n, skip = len(self._off.model.axes), max(0, self._free_from - self._next)
         (low, high), (least, most) = self._limits.position, self._limits.current
         positions, currents = moved.truth[skip:, :n], moved.truth[skip:, n:]
+        if not currents.size or (
+            low < positions.min() <= positions.max() < high and least <= currents.min() <= currents.max() <= most
+        ):
+            return
         out = np.any((positions <= low) | (positions >= high), axis=1)
         over = np.any((currents < least) | (currents > most), axis=1)
         trips = np.flatnonzero(out | over)

@@ -85,6 +85,7 @@ class SimulatedDevice(PlayedDevice):
             rate_hz=self._settings.rate_hz,
             columns=columns(self._rig, self._settings, si=self._si),
             plant=self._bench.parameters,
+            real=pace == "real",
         )
         self._seed = seed
 
