@@ -1,4 +1,4 @@
-"""Latency of the engine: a record comes at 20 kHz from another process through the ring in shared memory."""
+"""Latency of the engine: a record comes at 20 kHz, block by block as each is due."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ EVERY_S = 0.01
 CHANGE_S = 20.0
 GROUP = "Tracking: latency in real time, 20 kHz"
 COLUMNS = (
-    "samples of a block", "comes every", "median", "99 %", "largest", "lost blocks", "late blocks", "load of a core",
+    "samples of a block", "comes every", "median", "99 %", "largest", "late blocks", "load of a core",
 )  # fmt: skip
 
 
 def replayed(samples: Samples, size: int) -> StreamReport:
-    """Run the command's chain without its output: replay, ring, guard, supervisor, lines."""
+    """Run the command's chain without its output: replay, guard, supervisor, lines."""
     replay = blocks_of(record_of(samples), size, channels=("voltage", "position", "current"))
     supervisor = supervised(start_of("unstable-bearing"))
     reporter = Reporter(supervisor, every_s=EVERY_S, on_line=lambda _: None)
@@ -39,8 +39,7 @@ def replayed(samples: Samples, size: int) -> StreamReport:
         reporter.consume(Samples(u=u, y=y), stretch.first, restart=stretch.restart)
 
     return run(
-        replay, consume, reporter.reject, guard=StreamGuard(RATE, 3), pace="real-time", producer="process",
-        block_samples=size,
+        replay, consume, reporter.reject, guard=StreamGuard(RATE, 3), pace="real-time",
     )  # fmt: skip
 
 
@@ -58,7 +57,7 @@ def latency_tables() -> Iterator[Table]:
         assert report.latency is not None
         data[f"{size}"] = {**asdict(report.latency), "working_s": report.working_s, "seconds": report.seconds}
     before = (
-        f"A record of {SECONDS:.0f} s with a change of k_i, replayed at its own pace by another process; from the"
+        f"A record of {SECONDS:.0f} s with a change of k_i, replayed at its own pace; from the"
         " moment at which a block is due to the end of the work on it, guard, supervisor and a line every"
         f" {quantity(EVERY_S, 's')} included. A late block's successor was due before its end; {os.cpu_count()} cores,"
         f" load average before {os.getloadavg()[0]:.1f}."
@@ -70,4 +69,4 @@ def _row(size: int, report: StreamReport) -> tuple[str, ...]:
     of: Latency | None = report.latency
     assert of is not None
     times = [quantity(t, "s") for t in (size / RATE, of.median, of.p99, of.largest)]
-    return (str(size), *times, str(of.overruns), f"{of.late} of {report.blocks}", f"{report.working_s / SECONDS:.1%}")
+    return (str(size), *times, f"{of.late} of {report.blocks}", f"{report.working_s / SECONDS:.1%}")

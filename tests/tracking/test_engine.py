@@ -1,4 +1,4 @@
-"""The engine delivers everything, from this process and another, and ends cleanly however it ends."""
+"""The engine delivers everything, and ends cleanly however it ends."""
 
 import os
 import signal
@@ -11,18 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambid.errors import EstimationError, RecordError
+from ambid.errors import RecordError
 from ambid.record import Channel, Record
 from ambid.tracking.blocks import Block, blocks_of
 from ambid.tracking.engine import run
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.ring import BlockRing
 from tests.tracking.damage import RATE, blocks
 from tests.tracking.damage import signal as noise
 
 ROOT = Path(__file__).parents[3]
 X = noise(3000)
-EVERYWHERE = ["none", "process"]
 
 
 def replay(values=X, size=100):
@@ -64,21 +62,9 @@ def failing(n):
     raise RecordError("the disk is gone")
 
 
-class FailingReplay:
-    """A source that fails; it can be sent to another process."""
-
-    def __init__(self, n, error):
-        self.n, self.error = n, error
-
-    def __iter__(self):
-        yield from blocks(X)[: self.n]
-        raise self.error
-
-
-@pytest.mark.parametrize("producer", EVERYWHERE)
-def test_a_record_is_delivered_whole(producer):
+def test_a_record_is_delivered_whole():
     sink = Sink()
-    report = engine(replay(), sink, producer=producer, ring_blocks=4)
+    report = engine(replay(), sink)
     np.testing.assert_array_equal(sink.values(), X)
     assert (
         report.blocks,
@@ -87,20 +73,19 @@ def test_a_record_is_delivered_whole(producer):
         report.guard.n_rejected,
         report.guard.n_missing,
     ) == (30, 3000, 3000, 0, 0)
-    assert (report.torn, report.interrupted, dict(report.guard.events)) == (0, False, {})
-    assert (report.guard.n_reordered, report.latency.overruns) == (0, 0)
+    assert (report.interrupted, dict(report.guard.events)) == (False, {})
+    assert report.guard.n_reordered == 0
     assert 0 < report.latency.median <= report.latency.p99 <= report.latency.largest <= report.seconds
     assert 0 < report.working_s < report.seconds
 
 
-@pytest.mark.parametrize("producer", EVERYWHERE)
-def test_damage_is_reported_whichever_way_it_comes(producer):
+def test_damage_is_reported_whichever_way_it_comes():
     stream = blocks(X)
     stream[7] = Block(first=700, time_s=0.035, values=X[700:800].astype(np.float32))
     stream[9] = Block(first=900, time_s=0.045, values=X[900:1000, :2])
     del stream[20]
     sink = Sink()
-    report = engine(stream, sink, producer=producer)
+    report = engine(stream, sink)
     assert dict(report.guard.samples) == {"type": 100, "shape": 100, "gap": 100}
     assert [(r.kind, r.samples) for r in sink.rejections] == [("type", 100), ("shape", 100), ("gap", 100)]
     assert (report.guard.n_given, report.guard.n_rejected, report.guard.n_missing) == (2700, 200, 100)
@@ -114,23 +99,18 @@ def test_real_time_takes_its_time():
     assert report.guard.n_given == 3000
 
 
-def test_a_slow_consumer_costs_blocks_never_the_order():
+def test_a_slow_consumer_is_late_and_loses_nothing():
     sink = Sink(at=0, do=lambda: time.sleep(0.2))
-    report = engine(replay(), sink, producer="process", pace="real-time", ring_blocks=4)
-    assert report.latency.overruns > 0
+    report = engine(replay(), sink, pace="real-time")
     assert report.latency.largest > 0.1
     assert report.latency.late > 0
     assert report.latency.start is None  # it never caught up
-    for s in sink.stretches:
-        np.testing.assert_array_equal(s.values, X[s.first : s.first + len(s.values)])
-    assert report.guard.n_given == 3000 - 100 * report.latency.overruns
+    np.testing.assert_array_equal(sink.values(), X)
 
 
-@pytest.mark.parametrize("producer", EVERYWHERE)
-def test_an_exception_of_the_consumer_is_raised_and_nothing_is_left(producer):
+def test_an_exception_of_the_consumer_is_raised_and_nothing_is_left():
     with pytest.raises(ZeroDivisionError, match="on purpose"):
-        engine(replay(), Sink(at=500, do=raising(ZeroDivisionError("on purpose"))), producer=producer)
-    assert not list(Path("/dev/shm").glob(f"ambid-{os.getpid()}-*"))  # where Linux keeps them
+        engine(replay(), Sink(at=500, do=raising(ZeroDivisionError("on purpose"))))
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -141,40 +121,13 @@ def test_an_exception_of_the_source_is_raised_as_it_is():
     assert len(sink.stretches) == 5
 
 
-def test_an_exception_in_another_process_is_raised_here():
-    with pytest.raises(RecordError, match="gone over there"):
-        engine(FailingReplay(3, RecordError("gone over there")), Sink(), producer="process")
-
-
-class DyingReplay:
-    """A source whose process dies without a word."""
-
-    def __iter__(self):
-        yield from blocks(X)[:3]
-        os._exit(7)
-
-
-def test_a_process_that_dies_is_told_of_when_what_it_left_is_delivered():
-    sink = Sink()
-    with pytest.raises(EstimationError, match="ended early with exit code 7"):
-        engine(DyingReplay(), sink, producer="process")
-    np.testing.assert_array_equal(sink.values(), X[:300])
-
-
-def test_a_source_that_cannot_be_sent_is_refused():
-    with pytest.raises(EstimationError, match="cannot be sent to another process"):
-        engine(failing(5), Sink(), producer="process")
-
-
-@pytest.mark.parametrize("producer", EVERYWHERE)
-def test_an_interrupt_ends_with_everything_up_to_then_delivered(producer):
+def test_an_interrupt_ends_with_everything_up_to_then_delivered():
     def long():
         for k in range(0, 400_000, 100):
             yield Block(first=k, time_s=k / RATE, values=X[:100] + k)
 
-    source = replay(noise(400_000), 100) if producer == "process" else long()
     sink = Sink(at=5000, do=lambda: signal.raise_signal(signal.SIGINT))
-    report = engine(source, sink, producer=producer)
+    report = engine(long(), sink)
     assert report.interrupted
     assert report.guard.n_given == report.guard.n_received == len(sink.values()) >= 5100
     assert report.guard.n_given < 400_000
@@ -213,21 +166,6 @@ def test_whoever_calls_may_end_it():
     assert not report.interrupted
 
 
-def test_a_ring_of_others_is_read_and_left_to_them():
-    with BlockRing.create(rate_hz=RATE, channels=["a", "b", "c"]) as ring:
-        for block in blocks(X)[:20]:
-            ring.put(block)
-        sink = Sink()
-        report = engine(ring, sink, stopped=lambda: len(sink.stretches) >= 5)
-        assert report.guard.n_given == 2000  # all that had been acquired when it was to end
-        assert not ring.stopping
-        for block in blocks(X)[20:]:
-            ring.put(block)
-        ring.end()
-        assert engine(ring, sink).guard.n_given == 1000
-        np.testing.assert_array_equal(sink.values(), X)
-
-
 SCRIPT = """
 import sys
 import numpy as np
@@ -243,31 +181,16 @@ def consume(stretch):
 if __name__ == "__main__":
     x = np.random.default_rng(0).standard_normal(600_000)
     source = blocks_of(Record(rate_hz=20e3, channels=(Channel(name="a", unit="1", values=x),)), 100)
-    report = run(source, consume, guard=StreamGuard(20e3, 1), producer=sys.argv[1], pace="real-time")
+    report = run(source, consume, guard=StreamGuard(20e3, 1), pace="real-time")
     print(report.interrupted, report.guard.n_given == report.guard.n_received, report.guard.n_given, flush=True)
 """
 
 
-def test_a_producer_whose_consumer_was_killed_ends_too(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    with (tmp_path / "said").open("w") as said:
-        process = subprocess.Popen(
-            [sys.executable, str(script), "process"], stdout=subprocess.PIPE, stderr=said, text=True, cwd=ROOT
-        )
-    assert process.stdout.readline().strip() == "ready"
-    process.kill()
-    assert process.stdout.read() == ""  # returns when nobody holds the pipe any more: the child has ended
-    assert "Traceback" not in (tmp_path / "said").read_text()
-    assert not list(Path("/dev/shm").glob(f"ambid-{process.pid}-*"))
-
-
-@pytest.mark.parametrize("producer", EVERYWHERE)
-def test_an_interrupt_from_the_terminal_reaches_all_processes_and_leaves_no_word(producer, tmp_path):
+def test_an_interrupt_from_the_terminal_ends_it_and_leaves_no_word(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     process = subprocess.Popen(
-        [sys.executable, str(script), producer],
+        [sys.executable, str(script)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
     )  # fmt: skip
     assert process.stdout.readline().strip() == "ready"

@@ -42,7 +42,6 @@ from ambid.tracking.guard import ABSURD, StreamGuard
 from ambid.tracking.lines_file import Tally
 from ambid.tracking.numbers import Forcing
 from ambid.tracking.reporter import Reporter, header
-from ambid.tracking.ring import BlockRing
 from ambid.tracking.rpem import PhysicalRpem
 from ambid.tracking.supervisor import Supervisor, warm_up
 
@@ -173,7 +172,7 @@ def track(
 
 
 def follow(
-    blocks: Iterable[Block | Frame] | BlockRing, source: BenchRows, begin: Start, how: Following, *, live: bool = False
+    blocks: Iterable[Block | Frame], source: BenchRows, begin: Start, how: Following, *, live: bool = False
 ) -> Track:
     """Follow a bench's parameters through SI blocks from ``begin.first`` on, replayed or live: guard, supervisor and
     reporter; `live`: without a known end.
@@ -209,7 +208,6 @@ def follow(
             lambda stretch: reporter.consume(_samples(stretch, n_u, forcing), stretch.first, restart=stretch.restart),
             reporter.reject,
             guard=_guard(source, begin.estimate), pace=how.pace,
-            producer="process" if how.pace == "real-time" else "none", block_samples=source.replay.block_samples,
         )  # fmt: skip
     reporter.finish()
     summary = reporter.summary(computing_s=report.working_s, latency=report.latency, complete=not report.interrupted)

@@ -136,8 +136,8 @@ class Latency:
     median: float  # from the arrival of a block to the end of its work
     p99: float
     largest: float
-    overruns: int  # blocks that were lost because the ring was full
     late: int  # blocks that came before the work on the one before had ended
+    overruns: int = 0  # blocks of a running bench that were lost because too many waited
     # largest of the first blocks, until the work had caught up, s: the numbers above leave them out. None: it never did
     start: float | None = None
 

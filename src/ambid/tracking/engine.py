@@ -1,21 +1,17 @@
-"""The engine around a tracker: blocks go source -> ring -> guard -> consumer, timed, until they end or are interrupted.
-
-The ring serves a producer in another process, never kept waiting by the consumer. Every wait can be ended.
+"""The engine around a tracker: blocks go source -> guard -> consumer, timed, until they end or are interrupted. Every
+wait can be ended.
 """
 
 from __future__ import annotations
 
-import pickle
 import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import ceil, log10
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any, Literal, cast
 
@@ -25,7 +21,6 @@ from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
 from ambid.tracking.blocks import Block, Frame, Passed, Rejection, Stretch, paced
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.ring import BlockRing
 
 _LOWEST = 1e-7  # s: upper edge of the first bin
 _PER_DECADE = 100
@@ -33,13 +28,12 @@ _DECADES = 11  # up to 10 000 s; what is beyond is in the last bin
 
 
 class LatencyStatistics:
-    """Counts latencies: `count` of blocks; `largest`, s; `overruns`: lost because the ring was full; `late`: come
-    before the work on the one before had ended; `start`: largest until `caught_up`, s, left out of the others, None
-    before.
+    """Counts latencies: `count` of blocks; `largest`, s; `late`: come before the work on the one before had ended;
+    `start`: largest until `caught_up`, s, left out of the others, None before.
     """
 
     def __init__(self) -> None:
-        self.overruns = self.late = self.count = 0
+        self.late = self.count = 0
         self.start: float | None = None
         self.largest = 0.0
         self._bins = np.zeros(_PER_DECADE * _DECADES + 1, dtype=np.int64)
@@ -82,98 +76,12 @@ class LatencyStatistics:
             median=self.quantile(0.5),
             p99=self.quantile(0.99),
             largest=self.largest,
-            overruns=self.overruns,
             late=self.late,
             start=self.start,
         )
 
 
 Pace = Literal["fastest", "real-time"]
-
-_LOOK_S = 0.1  # how often a wait looks whether it should end
-_PATIENCE_S = 5.0  # for a producer that was asked to stop
-
-
-@contextmanager
-def produced_beside(source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> Iterator[_Producer]:
-    """Run a source, which can be pickled, in another process while the context lasts; on leaving, tell it to stop and
-    raise its exception, unless another is on its way.
-    """
-    maker = _Producer(source, ring, rate_hz, pace)
-    try:
-        yield maker
-    except BaseException:
-        ring.stop()
-        maker.end()
-        raise
-    ring.stop()
-    failure = maker.end()
-    if failure is not None:
-        raise failure
-
-
-def fill(
-    source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace, *, alone: Callable[[], bool] = lambda: False
-) -> None:
-    """Put a source's blocks into a ring until they end or the consumer wants no more, or is dead, by `alone`."""
-
-    def stopped() -> bool:
-        return ring.stopping or alone()
-
-    try:
-        if pace == "real-time":
-            for frame in paced(source, rate_hz, stopped=stopped):
-                if stopped():
-                    return
-                ring.put(frame.block, frame.arrived_s)
-            return
-        for block in source:
-            while not ring.wait_for_room(_LOOK_S):
-                if stopped():
-                    return
-            if ring.stopping:
-                return
-            ring.put(block)
-    finally:
-        ring.end()
-
-
-class _Producer:
-    """The source in a fresh process; a forked one could inherit locks that nobody will open."""
-
-    def __init__(self, source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> None:
-        try:
-            packed = pickle.dumps(source)
-        except (pickle.PicklingError, TypeError, AttributeError) as failure:
-            raise EstimationError(
-                f"the source of blocks cannot be sent to another process ({failure}). Use a Replay"
-            ) from None
-        context = get_context("spawn")
-        self._ours, theirs = context.Pipe(duplex=False)
-        self._process = context.Process(target=_child, args=(packed, ring.name, rate_hz, pace, theirs), daemon=True)
-        with ignoring_interrupts():  # the child begins so, and one that comes before it runs does not end it
-            self._process.start()
-        theirs.close()
-
-    def alive(self) -> bool:
-        """Return whether something may still come."""
-        return self._process.is_alive()
-
-    def end(self) -> BaseException | None:
-        try:
-            failure: BaseException | None = self._ours.recv() if self._ours.poll(_PATIENCE_S) else None
-            dead = False
-        except EOFError:
-            failure, dead = None, True
-        self._process.join(_PATIENCE_S)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join()
-        if dead:
-            return EstimationError(
-                f"the source process ended early with exit code {self._process.exitcode}. Start it again"
-            )
-        return failure
 
 
 @contextmanager
@@ -189,25 +97,6 @@ def ignoring_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connection) -> None:
-    """Fill the ring from another process; interrupts are the consumer's business."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    outcome: BaseException | None = None
-    parent = parent_process()
-    with BlockRing.attach(name) as ring:
-        try:
-            fill(pickle.loads(packed), ring, rate_hz, pace, alone=lambda: parent is not None and not parent.is_alive())
-        except Exception as failure:
-            outcome = failure
-    with suppress(BrokenPipeError):  # the consumer was killed: nobody is there to be told
-        try:
-            tell.send(outcome)
-        except BrokenPipeError:
-            raise
-        except Exception:
-            tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Correct the source"))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamReport:
     """What went through an engine; samples and rejections are counted by the `guard`."""
@@ -216,29 +105,23 @@ class StreamReport:
     blocks: int  # that came
     seconds: float  # from the first wait to the end, s of clock
     working_s: float  # of these, in the guard and the consumer
-    # none if nothing came. In real time from when a block was due; as fast as possible, with the time in the ring.
-    latency: Latency | None
-    torn: int  # blocks lost because their check value was wrong
+    latency: Latency | None  # in real time from when a block was due; None if nothing came
     interrupted: bool  # whether it ended by an interrupt, everything up to then being delivered
 
 
 def run(
-    source: Iterable[Block | Frame] | BlockRing,
+    source: Iterable[Block | Frame],
     consume: Callable[[Stretch], object],
     reject: Callable[[Rejection], object] | None = None,
     *,
     guard: StreamGuard,
     pace: Pace = "fastest",
-    producer: Literal["none", "process"] = "none",
-    ring_blocks: int = 64,
-    block_samples: int = 200,
     stopped: Callable[[], bool] = lambda: False,
 ) -> StreamReport:
     """Pump blocks (of the fastest pace also frames, with their time of arrival) through a fresh `guard` to `consume`,
     given each clean stretch, and `reject`, given each rejection. An interrupt (Ctrl-C), or `stopped` asked between
     blocks, ends the stream: what was acquired is delivered, and the report says so; a second one interrupts the
-    consumer. Exceptions of source or consumer are raised again; the ring, of `ring_blocks` times `block_samples`, is
-    removed in any case. `pace`: of a source that is no ring.
+    consumer. Exceptions of source or consumer are raised again.
     """
     pump = _Pump(guard, consume, reject)
     with _Interrupt() as interrupt:
@@ -246,24 +129,12 @@ def run(
         def ending() -> bool:
             return interrupt.came or stopped()
 
-        if isinstance(source, BlockRing):
-            pump.drain(source, ending, None)
-        elif producer == "none":
-            frames = (
-                paced(cast("Iterable[Block]", source), guard.rate_hz, stopped=ending)
-                if pace == "real-time"
-                else (x if isinstance(x, Frame) else Frame(block=x, arrived_s=time.perf_counter()) for x in source)
-            )
-            pump.pull(frames, ending, interrupt)
-        else:
-            names = [f"c{k}" for k in range(guard.n_channels)]
-            with (
-                BlockRing.create(
-                    rate_hz=guard.rate_hz, channels=names, slots=ring_blocks, block_samples=block_samples
-                ) as ring,
-                produced_beside(cast("Iterable[Block]", source), ring, guard.rate_hz, pace) as maker,
-            ):
-                pump.drain(ring, ending, maker)
+        frames = (
+            paced(cast("Iterable[Block]", source), guard.rate_hz, stopped=ending)
+            if pace == "real-time"
+            else (x if isinstance(x, Frame) else Frame(block=x, arrived_s=time.perf_counter()) for x in source)
+        )
+        pump.pull(frames, ending, interrupt)
         return pump.finish(interrupted=interrupt.came)
 
 
@@ -279,7 +150,7 @@ class _Pump:
         self._done = float("-inf")
         self._begun = time.perf_counter()
         self._working = 0.0
-        self.blocks = self.torn = 0
+        self.blocks = 0
 
     def take(self, frame: Frame) -> None:
         """Work on one frame."""
@@ -316,23 +187,6 @@ class _Pump:
                 return
             self.take(frame)
 
-    def drain(self, ring: BlockRing, ending: Callable[[], bool], maker: _Producer | None) -> None:
-        """Take all frames of a ring; when it should end, those that it holds by then."""
-        left: int | None = None
-        while left is None or left > 0:
-            if left is None and ending():
-                if maker is not None:  # a ring of others is left to go on
-                    ring.stop()
-                left = ring.filled
-                continue
-            frame = ring.read(_LOOK_S if left is None else 0.0)
-            left = None if left is None else left - 1
-            if frame is not None:
-                self.take(frame)
-            elif ring.ended or (maker is not None and not maker.alive() and not ring.filled):
-                break
-        self._statistics.overruns, self.torn = ring.overruns, ring.torn
-
     def finish(self, *, interrupted: bool) -> StreamReport:
         """Deliver what waits in the guard, and say what went through."""
         self._deliver(self._guard.flush(), 0)
@@ -342,7 +196,6 @@ class _Pump:
             seconds=time.perf_counter() - self._begun,
             working_s=self._working,
             latency=self._statistics.summary(),
-            torn=self.torn,
             interrupted=interrupted,
         )
 
