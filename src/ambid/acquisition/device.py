@@ -111,8 +111,6 @@ class Counters:
     resent: int = 0  # commands that were sent again for want of an answer
     # what the controller counted: ``overruns``, ``dropped``, ``rx_errors``, ``rx_lost``, ``busy_us``, ``supply_mv``
     controller: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)
-    drift: float = float("nan")  # of the controller's clock against the host's, relative; NaN while unknown
-    drift_sd: float = float("nan")  # its standard deviation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from pathlib import Path
 
 from ambid.cli.options import Values, verb
 from ambid.errors import AmbidError
-
-PASSWORD = "AMBID_CONSOLE_PASSWORD"
 
 
 @verb("console")
@@ -25,13 +21,6 @@ def command(v: Values) -> None:
         if (missing.name or "").startswith("ambid"):
             raise
         raise AmbidError(f"the console needs {missing.name}. Install it: pip install 'ambid[console]'") from None
-    tls = None
-    if v.certificate is not None:
-        certificate, _, key = v.certificate.partition(",")
-        tls = Path(certificate), Path(key or certificate)
-        for path in tls:
-            if not path.is_file():
-                raise AmbidError(f"{path} is no file. Correct the path")
 
     def ready(link: str) -> None:
         print(f"console of {v.folder}: {link}  (Ctrl-C ends it; runs go on)", flush=True)
@@ -40,7 +29,4 @@ def command(v: Values) -> None:
 
             webbrowser.open(link)
 
-    serve(
-        v.folder, port=v.port, read_only=v.read_only, listen=v.listen, tls=tls,
-        password=os.environ.get(PASSWORD) or None, on_ready=ready,
-    )  # fmt: skip
+    serve(v.folder, port=v.port, read_only=v.read_only, on_ready=ready)

@@ -35,7 +35,7 @@ _BARE = "/static/"  # holds nothing of the folder
 _CHANGES_NOTHING = "/api/previews"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-    "font-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    "font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _REPORT_POLICY = (
     "sandbox allow-scripts allow-modals allow-popups; default-src 'none'; script-src 'unsafe-inline'; style-src "
@@ -46,20 +46,14 @@ _REPORT_POLICY = (
 class Guard:
     """Lets through what belongs here.
 
-    `hosts`: values of Host that are the console's own; `scheme`: http or https; `password`: that opens another session;
-    None: only the token does; `read_only`: nothing may be changed.
+    `hosts`: values of Host that are the console's own; `read_only`: nothing may be changed.
     """
 
-    def __init__(
-        self, app: ASGIApp, *, hosts: Iterable[str], scheme: str = "http", password: str | None = None,
-        read_only: bool = False,
-    ) -> None:  # fmt: skip
-        self._app, self._hosts, self._scheme = app, frozenset(hosts), scheme
+    def __init__(self, app: ASGIApp, *, hosts: Iterable[str], read_only: bool = False) -> None:
+        self._app, self._hosts, self._read_only = app, frozenset(hosts), read_only
         self.cookie = f"{COOKIE}_{next(iter(self._hosts)).rpartition(':')[2]}"  # ports of an address share cookies
-        self._password, self._read_only = password, read_only
         self.token: str | None = secrets.token_urlsafe(32)
         self._sessions: dict[str, str] = {}  # cookies, and the key of each
-        self._wrong = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request through, or answer why not."""
@@ -94,13 +88,11 @@ class Guard:
         host, origin = headers.get(b"host", b"").decode("latin-1"), headers.get(b"origin", b"").decode("latin-1")
         if host not in self._hosts:
             return _no(421, "this console answers to its own address only. Open the link that it printed")
-        if origin and origin != f"{self._scheme}://{host}":
+        if origin and origin != f"http://{host}":
             return _no(403, "the request comes from another page")
         if scope["type"] == "websocket":
             return None if origin and self._known(headers, scope) else _no(403, "")
         if scope["method"] == "POST":
-            if self._password is not None and scope["path"] == "/login":
-                return None
             if HEADER not in headers or not headers.get(b"content-type", b"").startswith(b"application/json"):
                 return _no(403, "a change needs the header X-Ambid and JSON")
             length = headers.get(b"content-length", b"0")
@@ -111,8 +103,6 @@ class Guard:
         if scope["path"] == "/" and scope["query_string"]:
             return self._opened(parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0])
         if not self._known(headers, scope):
-            if self._password is not None and scope["path"] == "/":
-                return Response(_LOGIN, media_type="text/html")
             return _no(403, "open the link that 'ambid console' printed; each link opens one page. Start it again")
         if scope["method"] == "POST" and self._read_only and not scope["path"].startswith(_CHANGES_NOTHING):
             return _no(403, f"this console was started with {flag('read_only')}. Start it without")
@@ -123,26 +113,11 @@ class Guard:
         if self.token is None or not hmac.compare_digest(token.encode(), self.token.encode()):
             return _no(403, "this link was used before, or is wrong. Start 'ambid console' again for another")
         self.token = None
-        return self._session()
-
-    def login(self, password: str) -> Response:
-        """Open a session by password; each wrong one makes the next wait longer."""
-        if self._password is None or self._wrong >= 50:
-            return _no(403, "no further attempts. Start 'ambid console' again")
-        if not hmac.compare_digest(password.encode(), self._password.encode()):
-            self._wrong += 1
-            return _no(403, "wrong password")
-        self._wrong = 0
-        return self._session()
-
-    def _session(self) -> Response:
-        """Begin a session: the key goes into the fragment of an address, which browsers send to no server."""
+        # the key goes into the fragment of an address, which browsers send to no server
         session, key = secrets.token_urlsafe(32), secrets.token_urlsafe(32)
         self._sessions[session] = key
         answer = RedirectResponse(f"/#key={key}", status_code=303)
-        answer.set_cookie(
-            self.cookie, session, httponly=True, samesite="strict", secure=self._scheme == "https", path="/"
-        )
+        answer.set_cookie(self.cookie, session, httponly=True, samesite="strict", path="/")
         return answer
 
     def _known(self, headers: MutableMapping[bytes, bytes], scope: Scope) -> bool:
@@ -165,13 +140,6 @@ class Guard:
             right = hmac.new(key.encode(), path.encode(), hashlib.sha256).hexdigest()
             return hmac.compare_digest(proof.encode(), right.encode())
         return hmac.compare_digest(headers.get(KEY, b""), key.encode())
-
-
-_LOGIN = (
-    "<!doctype html><meta charset=utf-8><title>ambid console</title>"
-    "<form method=post action=/login><label>Password <input type=password name=password autofocus></label>"
-    "<button>Open</button></form>"
-)
 
 
 def _headers(scope: Scope) -> MutableMapping[bytes, bytes]:

@@ -112,7 +112,6 @@ class Console:
         self._viewers = 0
         self._watching = Counter[tuple[str, str]]()  # feeds that a page watches, by run and page
         self._over: dict[str, dict[str, Any]] = {}  # runs that are over, as they are shown
-        self.guard: Guard | None = None
 
     def close(self) -> None:
         """Remove what is kept beside the folder."""
@@ -122,7 +121,6 @@ class Console:
         """Return what can be asked for."""
         return [
             Route("/", self._page),
-            Route("/login", self._login, methods=["POST"]),
             Route("/static/{name}", self._static),
             Route("/api/state", self._state),
             Route("/api/rigs/{number:int}", self._rig_text),
@@ -142,17 +140,6 @@ class Console:
         if name not in _STATIC:
             return Response(status_code=404)
         return Response(_resource(_STATIC[name], name), media_type=_TYPES[name.rpartition(".")[2]])
-
-    async def _login(self, request: Request) -> Response:
-        assert self.guard is not None
-        await asyncio.sleep(0.5)
-        try:
-            form = (await request.body()).decode("utf-8", "replace")
-        except ClientDisconnect:
-            form = ""
-        from urllib.parse import parse_qs
-
-        return self.guard.login(parse_qs(form).get("password", [""])[0])
 
     async def _state(self, request: Request) -> Response:
         entries = await run_in_threadpool(self.files.entries)
@@ -545,61 +532,32 @@ class _Line(H11Protocol):
 
 
 def serve(
-    folder: str | Path,
-    *,
-    port: int = 0,
-    read_only: bool = False,
-    listen: str = "127.0.0.1",
-    tls: tuple[Path, Path] | None = None,
-    password: str | None = None,
-    on_ready: Callable[[str], object] = print,
+    folder: str | Path, *, port: int = 0, read_only: bool = False, on_ready: Callable[[str], object] = print
 ) -> None:
-    """Serve the console of a folder until Ctrl-C.
-
-    `port`: 0: any that is free; `listen`: another address than the loopback's needs `tls` (certificate and key) and
-    `password`; `on_ready`: given the link, which opens the page once.
+    """Serve the console of a folder to this machine until Ctrl-C. `port`: 0: any that is free; `on_ready`: given the
+    link, which opens the page once.
     """
-    place = Path(folder).resolve()
+    place, address = Path(folder).resolve(), "127.0.0.1"
     if not place.is_dir():
         raise AmbidError(f"{folder} is no folder; a console shows one. Name it")
-    local = listen in ("127.0.0.1", "localhost", "::1")
-    if not local and (tls is None or not password):
-        raise AmbidError(
-            f"{setting('listen', listen)} lets others on the network in; it needs {setting('certificate')} and a "
-            "password. Give them"
-        )
     try:
-        family = socket.AF_INET6 if ":" in listen else socket.AF_INET
-        listening = socket.create_server((listen, port), family=family)
+        listening = socket.create_server((address, port))
     except (OSError, OverflowError) as failure:
         why = getattr(failure, "strerror", None) or failure
-        raise AmbidError(f"{setting('port', port)} at {listen} cannot be had: {why}. Choose another one") from None
+        raise AmbidError(f"{setting('port', port)} cannot be had: {why}. Choose another one") from None
     number = listening.getsockname()[1]
-    shown = f"[{listen}]" if ":" in listen else listen
-    names = {shown, "localhost", "127.0.0.1"} if local else {shown}
-    console, scheme = Console(place, read_only=read_only), "http" if tls is None else "https"
+    console = Console(place, read_only=read_only)
     guard = Guard(
-        Starlette(routes=console.routes()), hosts={f"{n}:{number}" for n in names}, scheme=scheme,
-        password=password, read_only=read_only,
-    )  # fmt: skip
-    console.guard = guard
+        Starlette(routes=console.routes()), hosts={f"{n}:{number}" for n in (address, "localhost")}, read_only=read_only
+    )
     config = uvicorn.Config(
         guard, http=_Line, ws="websockets-sansio", ws_max_size=4096, ws_max_queue=4, log_level="critical",
         access_log=False, limit_concurrency=64, timeout_keep_alive=15, timeout_graceful_shutdown=1,
         h11_max_incomplete_event_size=16_384, server_header=False, lifespan="off", proxy_headers=False,
-        ssl_certfile=None if tls is None else tls[0], ssl_keyfile=None if tls is None else str(tls[1]),
     )  # fmt: skip
     try:
-        config.load()
-    except OSError as failure:  # also one of TLS
-        listening.close()
-        raise AmbidError(
-            f"{setting('certificate')} cannot be used: {failure}. Give PEM files of one pair, or one that holds both"
-        ) from None
-    server = uvicorn.Server(config)
-    try:
-        on_ready(f"{scheme}://{shown}:{number}/?token={guard.token}")
-        server.run(sockets=[listening])
+        on_ready(f"http://{address}:{number}/?token={guard.token}")
+        uvicorn.Server(config).run(sockets=[listening])
     except KeyboardInterrupt:
         pass
     finally:

@@ -102,8 +102,6 @@ def acquired_sections(acquired: Acquired) -> list[Section]:
     busy = counters.controller.get("busy_us")
     if busy is not None:
         words += f"; longest controller tick {busy:.0f} us"
-    if math.isfinite(counters.drift):
-        words += f"; controller clock off by {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm"
     return [
         Section(parts=[Lines(lines=[head])]),
         Section(title="Columns", parts=[_table(q)]),

@@ -86,7 +86,7 @@ _JOBS = (
     ),
     declare(
         "console",
-        "folder port no_browser read_only listen certificate",
+        "folder port no_browser read_only",
         port={
             "help": "Port of the page; 0: any that is free.",
             "default": 0,

@@ -62,7 +62,6 @@ SETTINGS = (
         many=True,
         required=True,
     ),
-    Setting("certificate", "text", "FILE|CERT,KEY", "TLS certificate with its key, PEM: in one file, or in two."),
     Setting(
         "closed",
         "loop",
@@ -216,13 +215,6 @@ SETTINGS = (
         "Largest value, such as peak=9.5dB; repeatable.",
         many=True,
         shown="what the present loop has",
-    ),
-    Setting(
-        "listen",
-        "text",
-        "ADDRESS",
-        "Another address; it needs TLS files, and a password in AMBID_CONSOLE_PASSWORD.",
-        default="127.0.0.1",
     ),
     Setting("log_excitation", "switch", "", "Add a column 'excitation': the reference for 'ambid frf'."),
     Setting(

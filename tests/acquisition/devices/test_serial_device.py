@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ambid.acquisition.devices.line_device import ClockDrift, SerialDevice
+from ambid.acquisition.devices.line_device import SerialDevice
 from ambid.errors import DeviceError, RigError
 from ambid.rig import default_rig, load_rig
 from tests.acquisition.fake import FakeController, PtyBoard
@@ -201,27 +201,6 @@ def test_a_reader_who_is_too_slow_loses_counted_blocks(board):
         assert c.samples + c.lost == board.controller.ticks
         told = [e.count for e in device.events() if e.kind == "lost"]
         assert sum(told) == c.lost
-
-
-def test_the_clocks_of_a_line_in_real_time_are_compared(board):
-    with device_on(board) as device:
-        device.start("sample")
-        read(device, 100)
-        assert device.counters().drift != device.counters().drift  # not known yet
-
-
-def test_asking_for_events_works_out_no_drift(board, monkeypatch):
-    """It is asked with each block; the drift is a millisecond's work, which holds the line's thread up."""
-
-    def worked_out(clock):
-        raise AssertionError
-
-    monkeypatch.setattr(ClockDrift, "estimate", worked_out)
-    with device_on(board) as device:
-        device.start("sample")
-        read(device, 100)
-        assert [e.what for e in device.events()] == ["sampling"]
-        monkeypatch.undo()
 
 
 def test_a_rig_without_calibrations_is_refused_with_a_remedy():

@@ -330,7 +330,7 @@ class EmulatedDevice(LineDevice):
     """The firmware in an emulated controller. Everything but the copper is real: binary, converter, line, protocol.
 
     As fast as possible, its time is not the host's: it waits for a silent host and for a reader a quarter of a second
-    behind, and tells no drift. `bench`: the truth, by default daq.bench, else the rig's own numbers; `script`: see
+    behind. `bench`: the truth, by default daq.bench, else the rig's own numbers; `script`: see
     `Emulator`; `emulator`: the process while the device is open, whose log says what happened.
     """
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal, Self
-
-import numpy as np
 
 from ambid.acquisition.device import (
     MODES,
@@ -43,91 +40,14 @@ _NONE: Mapping[str, int] = MappingProxyType({})
 _TABLE_PART = 48  # elements in one message
 _LAW_PART = 24  # words in one message
 _TOLD = ("overruns", "dropped", "rx_errors", "rx_lost", "busy_us", "supply_mv")  # of a status
-_WINDOW_S = 0.25  # at first; doubled whenever the windows are full
-_WINDOWS = 512
-_LEAST = 40  # windows before anything is said: a latency that grows at first looks like a drift, known very well
-_FITTED = 7  # windows that a line is drawn through, at least
-_OUTLIER = 4.0  # robust standard deviations above the line: a stall of the host
-_ROUNDS = 6
 _FLOWING: tuple[State, ...] = ("sampling", "driving", "levitating")
 _STATES: tuple[State, ...] = ("idle", "sampling", "driving", "levitating", "fault")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Drift:
-    """What is known of a clock."""
-
-    drift: float = math.nan  # relative; positive if the controller's clock is fast, NaN while unknown
-    drift_sd: float = math.nan  # its standard deviation
-    offset_s: float = math.nan  # host time at which sample 0 was there, by `time.perf_counter`, s
-
-
-class ClockDrift:
-    """Learns from arrivals in constant memory; `rate_hz` is by the controller's clock."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._period = 1.0 / rate_hz
-        self._width = _WINDOW_S
-        self._lowest: dict[int, tuple[float, float]] = {}  # window -> time of the earliest, how late it was
-        self._origin: float | None = None
-
-    def learn(self, number: int, arrived_s: float) -> None:
-        """Take in a sample number and when it arrived by the host's clock, s."""
-        if self._origin is None:
-            self._origin = arrived_s - number * self._period
-        t = number * self._period
-        late, window = arrived_s - self._origin - t, int(t / self._width)
-        earliest = self._lowest.get(window)
-        if earliest is None or late < earliest[1]:
-            self._lowest[window] = (t, late)
-        if len(self._lowest) > _WINDOWS:
-            self._halve()
-
-    def estimate(self) -> Drift:
-        """Return what is known by now."""
-        if self._origin is None or len(self._lowest) < _LEAST:
-            return Drift()
-        # The newest window may not be full yet: its minimum would lie too high.
-        t, late = np.array([self._lowest[w] for w in sorted(self._lowest)[:-1]]).T
-        keep = np.ones(t.size, dtype=bool)
-        slope = level = 0.0
-        for _ in range(_ROUNDS):
-            slope, level = np.polyfit(t[keep], late[keep], 1)
-            rest = late - level - slope * t
-            middle = np.median(rest[keep])
-            spread = 1.4826 * np.median(np.abs(rest[keep] - middle))
-            now = rest <= middle + _OUTLIER * max(spread, 1e-7)
-            if now.sum() < _FITTED or (now == keep).all():
-                break
-            keep = now
-        return self._told(t[keep], late[keep], float(slope), float(level))
-
-    def _told(self, t: np.ndarray, late: np.ndarray, slope: float, level: float) -> Drift:
-        """Return the line with its standard deviation, which neighbours that are late together make wider."""
-        assert self._origin is not None
-        rest = late - level - slope * t
-        n = t.size
-        variance = float(rest @ rest) / max(n - 2, 1)
-        together = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), 1e-300)
-        wider = (1.0 + max(together, 0.0)) / (1.0 - min(max(together, 0.0), 0.95))
-        sd = math.sqrt(wider * variance / max(float(((t - t.mean()) ** 2).sum()), 1e-300))
-        # Late by `slope` seconds in each second of the controller: 1 / (1 + d) = 1 + slope.
-        return Drift(drift=1.0 / (1.0 + slope) - 1.0, drift_sd=sd, offset_s=self._origin + level)
-
-    def _halve(self) -> None:
-        self._width *= 2.0
-        merged: dict[int, tuple[float, float]] = {}
-        for window, (t, late) in self._lowest.items():
-            earliest = merged.get(window // 2)
-            if earliest is None or late < earliest[1]:
-                merged[window // 2] = (t, late)
-        self._lowest = merged
 
 
 class SampleStream:
     """Turns frames of samples into blocks and events. `heard` and `told` are called from the listener's thread.
 
-    `real`: whether the controller's time runs with the host's, else no drift is estimated; `convert`: counts
+    `real`: whether the controller's time runs with the host's; `convert`: counts
     (n_samples, n_columns) to what blocks hold; `live`: whether what is told is of this session; `ending`: it was asked
     to stop.
     """
@@ -143,8 +63,6 @@ class SampleStream:
         self._running = False
         self.live = self.ending = False
         self._events: list[DeviceEvent] = []
-        self._clock: ClockDrift | None = None
-        self._drift = Drift()
 
     @property
     def state(self) -> State:
@@ -157,14 +75,6 @@ class SampleStream:
         """What became of the samples."""
         with self._lock:
             return replace(self._decoder.counters)
-
-    def drift(self) -> Drift:
-        """Return what is known of the clock."""
-        with self._lock:
-            now = self._clock.estimate() if self._clock is not None else Drift()
-            if now.drift == now.drift and not now.drift_sd > self._drift.drift_sd:
-                self._drift = now
-            return self._drift
 
     def events(self) -> list[DeviceEvent]:
         """Return what was told since the last call."""
@@ -182,9 +92,6 @@ class SampleStream:
         with self._lock:
             self._base = self._next
             self._decoder.restart()
-            if self._real:
-                self.drift()
-                self._clock = ClockDrift(self._rate)
             self._running = True
             self.frames.begin()
 
@@ -225,8 +132,6 @@ class SampleStream:
                 return  # of an earlier session
             samples = self._decoder.decode(payloads, arrived_s if self._real else None)
             self._pass_on(samples, arrived_s)
-            if len(samples) and self._clock is not None:
-                self._clock.learn(int(samples.ticks[-1]), arrived_s)
 
     def told(self, what: Message) -> None:
         """Take a fault, or a status."""
@@ -532,7 +437,7 @@ class LineDevice(ABC):
         controller.ask("arm", {"period": self._settings.period, "checksum": law.checksum, **trial})
 
     def _counted(self, c: Controller) -> Counters:
-        line, samples, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()
+        line, samples, frames = c.counters, self._stream.counters, self._stream.frames
         return Counters(
             samples=samples.samples - frames.overrun_samples,
             lost=samples.lost + frames.overrun_samples,
@@ -541,8 +446,6 @@ class LineDevice(ABC):
             overruns=frames.overruns + c.reader.overruns,
             resent=c.resent,
             controller=MappingProxyType(dict(self._status)),
-            drift=drift.drift,
-            drift_sd=drift.drift_sd,
         )
 
     def _damaged(self, c: Controller) -> int:
@@ -563,8 +466,8 @@ class LineDevice(ABC):
 class SerialDevice(LineDevice):
     """The controller behind a serial port or a pseudo-terminal, its `rig` with ``[daq]`` and calibrations from counts.
 
-    Blocks hold counts. ``Block.time_s`` is sample number over rate by the controller's clock, whose drift against the
-    host's is in the counters; a command is sent again after `answer_s`.
+    Blocks hold counts. ``Block.time_s`` is sample number over rate by the controller's clock; a command is sent again
+    after `answer_s`.
     """
 
     def __init__(self, port: str, rig: Rig, *, answer_s: float = 0.3) -> None:
