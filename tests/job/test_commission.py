@@ -21,6 +21,7 @@ from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning import FILES, REDESIGNED, Declined, check_folder, commission
 from ambid.job.commissioning_steps import STEPS, Plan, tracking
 from ambid.job.commissioning_steps import record as judged_record
+from ambid.job.results import load
 from ambid.record import read_record
 from ambid.rig import load_rig
 from tests.acquisition.test_look import WHOLE
@@ -44,6 +45,7 @@ def ran(folder, device, *, rig=None, plan=SHORT, **options):
     assert told["steps"][-1]["reasons"] == list(done.steps[-1].reasons)
     assert all(s.passed for s in done.steps[:-1])
     assert {p.name for p in folder.iterdir()} <= set(FILES)
+    assert load(folder / "commission.json").dumps() == (folder / "commission.json").read_text()
     return done
 
 

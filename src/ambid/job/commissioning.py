@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Self, Unpack
 
 from ambid.acquisition.device import Device, DeviceInfo, Program
 from ambid.acquisition.review import loop_on, refuse_unstable
@@ -20,7 +20,7 @@ from ambid.acquisition.trials import VOLTAGE, Kept, Look, Room, Size, make_look
 from ambid.control.design import Design
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
-from ambid.estimation.estimate import Estimate, json_text, plain_json
+from ambid.estimation.estimate import Estimate, json_text, plain_json, read_as
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
@@ -30,12 +30,13 @@ from ambid.job.experiment_design import HIGHEST, design_experiment
 from ambid.job.identification import identify_axis
 from ambid.job.loop_margins import margins, margins_beside
 from ambid.job.presentation import page
+from ambid.job.results import load_result
 from ambid.job.track_live import track_live
 from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.report.commission import Step, trace_picture
-from ambid.rig import Rig, rig_text
+from ambid.rig import Rig, load_rig, rig_text
 from ambid.rig.load import SELECTED
 from ambid.settings.caller import setting
 from ambid.simulation.margins import LoopMargins
@@ -74,6 +75,21 @@ class Commissioned(Result):
     device: DeviceInfo
     plan: Plan
     names: tuple[StepName, ...] = STEPS  # of all steps, those that were not reached too
+
+    @classmethod
+    def of_file(cls, document: Mapping[str, Any], path: str) -> Self:
+        """Read ``commission.json`` and what stands beside it: the rig and, as far as it came, estimate and track."""
+        folder = Path(path).parent
+        plan, device = read_as(Plan, document.get("wishes"), "wishes"), document.get("device")
+
+        def beside(name: str) -> Any:
+            return load_result(folder / name) if (folder / name).exists() else None
+
+        return cls(
+            steps=read_as(tuple[Step, ...], document.get("steps"), "steps"), estimate=beside("estimate.json"),
+            track=beside("track.jsonl"), folder=folder, rig=load_rig(folder / "rig.toml"), plan=plan, names=plan.steps,
+            device=read_as(DeviceInfo, device and {**device, "columns": []}, "device"),
+        )  # fmt: skip
 
     @property
     def reasons(self) -> tuple[Reason, ...]:

@@ -122,11 +122,15 @@ def _fit(document: Mapping[str, Any], path: str) -> AnyFit:
 
 
 def _whole(module: str, name: str, job: str) -> Callable[[Mapping[str, Any], str], Any]:
-    """Return a reader of a result whose file has all its fields by name."""
+    """Return a reader of a result whose file has all its fields by name, or that reads what stands beside it too."""
 
     def read(document: Mapping[str, Any], path: str) -> Any:
         kind = getattr(import_module(f"ambid.{module}"), name)
-        return read_whole(lambda: read_as(kind, document), f"{name.lower()} {path}", name.lower(), job)
+        read_beside = getattr(kind, "of_file", None)
+        return read_whole(
+            lambda: read_as(kind, document) if read_beside is None else read_beside(document, path),
+            f"{name.lower()} {path}", name.lower(), job,
+        )  # fmt: skip
 
     return read
 
@@ -151,6 +155,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     _EXPERIMENT: _whole("control.experiment", "Experiment", "design_experiment"),
     "ambid.design/1": _whole("control.design", "Design", "design_controller"),
     "ambid.history/1": _whole("ledger.history", "History", "history"),
+    "ambid.commission/1": _whole("job.commissioning", "Commissioned", "commission"),
     "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet_simulate"),
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
     "ambid.agreement/1": _whole("validation.agreement", "Agreement", "compare"),

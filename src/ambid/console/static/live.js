@@ -204,7 +204,8 @@ export class Live extends Watched {
     });
     if (this.ring && this.updates % 4 === 0) this.drawOrbit();
     if (this.frozen) return;
-    $("count").textContent = `${end.toFixed(1)} s, ${this.samples} samples`;
+    const left = this.over || this.wanted === Infinity ? "" : `, ${seconds(Math.max(0, this.wanted - end))} left`;
+    $("count").textContent = `${end.toFixed(1)} s, ${this.samples} samples${left}`;
     $("lost").textContent = this.lost ? `${this.lost} samples LOST` : "0 lost"; $("lost").className = this.lost ? "late" : "";
     this.lags.push(Date.now() / 1000 - this.fresh); if (this.lags.length > 2000) this.lags.shift();
     this.updates = (this.updates ?? 0) + 1;
