@@ -52,7 +52,11 @@ def command(v: Values) -> None:
     known, stop, behind = load_rig(v.rig), Stop(), None if v.bench is None else preset_of(v.bench) or v.bench
     settings = v.only("seconds excitation amplitude band mode settle seed")
     settings |= {"stopped": stop.wished, "arm": None if v.arm is None else load_rig(v.arm)}
-    wanted, start, before = Request(**settings), start_of_track(v.track, known), _changed(v.out)
+    wanted, start, before = Request(**settings), None, _changed(v.out)
+    if start_file is not None:
+        from ambid.job.track_live import live_start
+
+        start = live_start(start_file, known)
     job = Recording(wanted.measured(known), v.port, v.out, wanted.trial(v.port, known).settle_s, stop, force=v.force)
     if (v.out.exists() or v.out.is_symlink()) and not v.force:
         raise AmbidError(f"-o {v.out} already exists. Choose another name, or give --force")
@@ -226,23 +230,6 @@ def _journal(record: Path) -> Path:
     from ambid.acquisition.recorder.journal import journal_path
 
     return journal_path(record)
-
-
-def start_of_track(track: str | None, rig: Rig) -> Estimate | RotorEstimate | None:
-    """Read the estimate that tracking is to begin with; None where none is named."""
-    if track in (None, "auto"):
-        return None
-    if rig.rotor is not None:
-        from ambid.job.track_rotor import given_start
-
-        return given_start(str(track))
-    from ambid.job.results import read_linear_estimate
-
-    return read_linear_estimate(
-        str(track),
-        f"--track {track} is a black-box fit or a nonlinear estimate; tracking needs linear physical parameters. "
-        "Give an estimate of 'ambid identify --json' without --nonlinear",
-    )
 
 
 def loop_lines(t: float, sensitivity: Mapping[str, Any]) -> list[str]:

@@ -35,7 +35,7 @@ def command(v: Values) -> None:
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning import check_folder
-    from ambid.job.commissioning_steps import Plan
+    from ambid.job.commissioning_steps import Plan, second_s
     from ambid.physics.presets import preset_of
     from ambid.report.commission import next_text, step_section
     from ambid.report.device import progress_line
@@ -45,7 +45,7 @@ def command(v: Values) -> None:
 
     outputs = Outputs(v.rig, **v.outputs)
     plan = Plan(
-        record_s=v.seconds, second_s=_second_s(v.seconds), track_s=v.track_seconds, amplitude_v=v.amplitude,
+        record_s=v.seconds, second_s=second_s(v.seconds), track_s=v.track_seconds, amplitude_v=v.amplitude,
         band_hz=v.band, **v.only("widest seed redesign"),
     )  # fmt: skip
     known, paint, stop = load_rig(v.rig), painter(), Stop()
@@ -144,11 +144,6 @@ def _line(verb: str, given: Mapping[str, object]) -> str:
     """Write a command as a shell takes it, with the options that are given."""
     words = [w for name, value in given.items() if value is not None for w in (name, str(value)) if w]
     return shlex.join(["ambid", *verb.split(), *words])
-
-
-def _second_s(seconds: float) -> float:
-    """Return the length of the record for validation, s: two fifths, but where the first is short as long as that."""
-    return max(0.4 * seconds, min(seconds, 4.0))
 
 
 def _check_port(port: str, *, yes: bool) -> None:

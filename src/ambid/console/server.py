@@ -150,8 +150,7 @@ class Console:
         return _reply(
             {
                 "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
-                "left_out": self.files.left_out, "read_only": self._read_only,
-                "now": time.time(),
+                "left_out": self.files.left_out, "read_only": self._read_only, "looks": _LOOKS, "now": time.time(),
             }
         )  # fmt: skip
 

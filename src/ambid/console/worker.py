@@ -376,18 +376,13 @@ def _live(worker: Worker) -> None:
     from ambid.acquisition.settings import BenchView, fault_words
     from ambid.console.look import limits
     from ambid.job.acquiring import Request, ready
-    from ambid.job.results import read_linear_estimate
-    from ambid.job.track_live import track_live
-    from ambid.job.track_rotor import given_start
+    from ambid.job.track_live import live_start, track_live
     from ambid.rig import load_rig
 
     spec, rig_path, start, arm = worker.spec, worker.path("rig"), worker.path("estimate"), worker.path("arm")
     assert rig_path is not None
     rig, out = load_rig(rig_path), worker.folder / str(spec["out"])
-    plant, known = rig.plant, None
-    if start is not None:
-        wrong = f"{start.name} is no linear estimate. Choose one"
-        known = read_linear_estimate(start, wrong) if rig.rotor is None else given_start(start)
+    plant, known = rig.plant, None if start is None else live_start(start, rig)
     wanted = Request(
         seconds=min(float(spec.get("seconds", 60.0)), _LONGEST_S), excitation=spec.get("excitation") or None,
         amplitude=spec.get("amplitude"), seed=0, stopped=worker.stopped, arm=None if arm is None else load_rig(arm),
@@ -563,7 +558,7 @@ def _commission(worker: Worker) -> None:
     from ambid.acquisition.session import Progress
     from ambid.job import commission
     from ambid.job.acquiring import opened
-    from ambid.job.commissioning_steps import Plan
+    from ambid.job.commissioning_steps import Plan, second_s
     from ambid.report.document import plain_parts
     from ambid.report.drawing import single
     from ambid.report.picture import image
@@ -574,7 +569,7 @@ def _commission(worker: Worker) -> None:
     rig, folder = load_rig(rig_path), worker.folder / str(spec["out"])
     seconds = float(spec.get("seconds", 20.0))
     plan = Plan(
-        record_s=seconds, second_s=max(0.4 * seconds, min(seconds, 4.0)), track_s=float(spec.get("track_seconds", 5.0)),
+        record_s=seconds, second_s=second_s(seconds), track_s=float(spec.get("track_seconds", 5.0)),
         redesign=bool(spec.get("redesign", False)),
     )  # fmt: skip
     worker.feed.tell("plan", {"steps": list(plan.steps)}, sticky="plan")

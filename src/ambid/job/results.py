@@ -188,14 +188,6 @@ def experiment_of(excitation: object) -> Experiment | None:
     return found
 
 
-def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:
-    """Read an estimate from which linear tracking can begin; `otherwise` is the refusal of any other result."""
-    found = load_result(path)
-    if not isinstance(found, Estimate):
-        raise EstimationError(otherwise)
-    return found
-
-
 def data_of(
     known: AnyEstimate | AnyFit, record: Any, rig: Rig | None = None, *, where: str, **reading: Unpack[Reading]
 ) -> Any:

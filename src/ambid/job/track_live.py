@@ -24,7 +24,7 @@ from ambid.arrays import Array
 from ambid.errors import AmbidError, DeviceError
 from ambid.estimation.estimate import Estimate
 from ambid.job.following import Following, FollowingWords
-from ambid.job.track_start import BenchRows, start_of
+from ambid.job.track_start import BenchRows, read_start, start_of
 from ambid.job.tracking import follow
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
@@ -120,6 +120,15 @@ def track_live(
         latency = replace(track.totals.latency, overruns=queue.overruns)
         track = replace(track, totals=replace(track.totals, latency=latency))
     return LiveTrack(track=track, run=runner.report(), overruns=queue.overruns)
+
+
+def live_start(path: str | Path, rig: Rig) -> Estimate | RotorEstimate:
+    """Read the estimate with which a track is to begin, so that another file is refused before anything moves."""
+    if rig.rotor is None:
+        return read_start(path)
+    from ambid.job.track_rotor import given_start
+
+    return given_start(path)
 
 
 def _rotor_start_s(course: Course, start: object, rate_hz: float) -> float:

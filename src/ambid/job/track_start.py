@@ -15,7 +15,7 @@ from ambid.errors import EstimationError, RecordError, counted
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, began, known_rig, load_bench
 from ambid.job.identification import identify_axis
-from ambid.job.results import read_linear_estimate
+from ambid.job.results import load_result
 from ambid.job.sensors import fused_record, sensor_events
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
@@ -176,7 +176,7 @@ def start_of(
         estimate, first = _identify_beginning(source, rig, start)
         numbers = _numbers(estimate, source)
     else:
-        estimate, first = start if isinstance(start, Estimate) else _read(start), 0
+        estimate, first = start if isinstance(start, Estimate) else read_start(start), 0
         try:
             _check_fit(estimate, source, rig)
             if rig_speaks:
@@ -247,15 +247,18 @@ def _identify_beginning(source: BenchRows, rig: Rig, seconds: float | None) -> t
     return identify_axis(part, rig), first
 
 
-def _read(path: object) -> Estimate:
+def read_start(path: object) -> Estimate:
+    """Read the estimate from which tracking of one axis begins."""
     if not isinstance(path, (str, Path)):
         raise EstimationError(
             f"start is a {type(path).__name__}; it must be an Estimate, the path of one, or seconds. Give one"
         )
-    return read_linear_estimate(
-        path,
+    found = load_result(path)
+    if isinstance(found, Estimate):
+        return found
+    raise EstimationError(
         f"{path} holds a black-box fit or a nonlinear estimate; tracking starts from linear physical parameters."
-        f" Give {saved('identify')} without {setting('identify_nonlinear')}",
+        f" Give {saved('identify')} without {setting('identify_nonlinear')}"
     )
 
 

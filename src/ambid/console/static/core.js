@@ -10,7 +10,7 @@ const signer = crypto.subtle.importKey("raw", bytesOf(KEY), { name: "HMAC", hash
 // an address that the browser opens by itself
 export const proven = async (path) => `${path}?proof=${hex(await crypto.subtle.sign("HMAC", await signer, bytesOf(path)))}`;
 export const MOVING = ["live", "commission"], LATE_S = 0.2, SILENT_S = 1.5, START_S = 15, OLD_S = 2.0, SLOTS = 2000;
-export let state = { files: [], runs: [] };
+export let state = { files: [], runs: [], looks: [] };
 export const learn = (now) => { state = now; dispatchEvent(new Event("state")); };
 export let feed = null;  // the run that is watched
 export const attend = (run) => { feed = run; };

@@ -83,7 +83,7 @@ export async function job(spec, tell) {
   const of = state.files.find((f) => f.number === (spec.record ?? spec.estimate ?? spec.ledger))?.name ?? spec.out ?? "";
   const cancel = el("button", {}, "Cancel"), line = progressLine(`${spec.job} ${of}`, cancel);
   try {
-    const place = ["preview", "look", "history", "result", "fleet"].includes(spec.job) ? "/api/previews" : "/api/runs";
+    const place = state.looks.includes(spec.job) ? "/api/previews" : "/api/runs";
     const { id } = await ask(place, spec);
     cancel.onclick = () => ask(`${place}/${id}/say`, { word: "stop" }).catch(trouble);
     return await new Promise((done, fail) => listen(id, (m) => {
