@@ -12,6 +12,7 @@ import pytest
 from ambid import identify, simulate
 from ambid.acquisition.quality import Quality
 from ambid.acquisition.recorder import Recorder
+from ambid.cli.acquire import loop_lines
 from ambid.errors import DeviceError
 from ambid.physics.presets import preset
 from ambid.record import read_record
@@ -445,6 +446,16 @@ def test_the_help_names_ports_modes_and_the_journal(ambid):
     assert done.code == 0
     for word in ("emulated", "simulated", "replay:FILE", "--track", "levitate", "ambid recover", "--strict"):
         assert word in " ".join(done.out.split())
+
+
+def test_the_loop_of_a_rotor_is_told_axis_by_axis():
+    found = {"peak_db": {"value": 8.0, "sd": 0.1}, "measured_peak_db": None}
+    lines = loop_lines(3.0, {"ax": found, "ay": {**found, "measured_peak_db": 13.0, "measured_sd_db": 0.2}})
+    assert lines[0] == "sensitivity at 3 s, opened at the position:"
+    assert lines[1] == "  ax  8.00 dB, 95 % within ± 0.20 dB, zone A (> 99 %), predicted"
+    assert lines[2].startswith("  ay  13.00 dB, 95 % within ± 0.39 dB, zone ")
+    assert lines[2].endswith(", measured")
+    assert loop_lines(3.0, {}) == []
 
 
 @pytest.fixture(scope="module")
