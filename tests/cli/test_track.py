@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import pytest
 
-from ambid.cli.live import Keys
 from ambid.errors import AmbidError
 from ambid.recursive.lines import Event
 from ambid.tracking.lines_file import read_track
@@ -232,12 +231,6 @@ def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
     assert list(given) == ["R"]
 
 
-def test_help_says_what_the_keys_do(ambid):
-    found = ambid("track", "--help")
-    assert found.code == 0
-    assert "q ends" in " ".join(found.out.split())
-
-
 ON_A_TERMINAL = f"""
 import fcntl, importlib, sys, termios, time
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
@@ -248,8 +241,7 @@ def stand_in(record, rig, *, on_header, on_line, **settings):
     track = track_of(seconds=600.0, every_s=1.0, names=("R",))
     on_header(track.header)
     for line in track.lines:
-        for flag in on_line(line) or ():
-            open("flags", "a").write(flag + " ")
+        on_line(line)
         time.sleep(0.05)
 job.track = stand_in
 from ambid.cli import main
@@ -286,26 +278,8 @@ def on_a_terminal(folder, talk, *words):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals as POSIX has them")
-def test_keys_set_flags_and_q_ends_with_the_terminal_as_before(bench):
-    talk = [("model error", b"h"), ("(pressed: hold)", b"xt"), ("(pressed: track)", b"q")]
-    code, shown, same = on_a_terminal(bench, talk)
-    assert (code, talk, same) == (0, [], True)
-    assert "stopped before its end" in shown
-    assert (bench / "flags").read_text().split() == ["hold", "track"]
-    kept = read_track(bench / "track.jsonl")
-    assert 0 < len(kept.lines) < 600
-    assert kept.totals.complete is False
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="terminals as POSIX has them")
 def test_ctrl_c_on_a_terminal_leaves_it_as_before(bench):
     code, shown, same = on_a_terminal(bench, [("model error", b"\x03")])
     assert (code, same) == (130, True)
     assert "track.jsonl holds the track so far" in " ".join(shown.split())
     assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h")  # the cursor is shown again
-
-
-def test_no_keys_where_there_is_no_terminal(tmp_path):
-    with (tmp_path / "file").open("w+") as file, Keys(file.fileno()) as keys:
-        assert not keys.available
-        assert keys.read(0.0) == ""

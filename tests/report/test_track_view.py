@@ -35,7 +35,7 @@ def state_of(track, k):
 
 def test_everything_that_an_operator_needs_is_there(track):
     k = next(k for k, x in enumerate(track.lines) if x.state == "changed") + 1
-    text = shown(state_of(track, k), pressed="hold", behind_s=0.003)
+    text = shown(state_of(track, k), behind_s=0.003)
     for words in (
         "loop.csv: model one-axis, rpem",
         "changed",
@@ -46,20 +46,17 @@ def test_everything_that_an_operator_needs_is_there(track):
         "1 open change",
         "0 samples rejected",
         "times real time",
-        "h hold",
-        "(pressed: hold)",
     ):
         assert words in text, words
     for name in track.header.units:
         assert any(row.startswith(f"{name} ") and "±" in row and "●" in row for row in text.splitlines()), name
-    assert "h hold" not in shown(state_of(track, k))
     assert "14 samples rejected" in shown(state_of(track, len(track.lines) - 1))
 
 
 def test_it_fits_into_80_columns_and_plain_letters(track):
     state = state_of(track, 200)
-    assert max(map(len, shown(state, pressed="").splitlines())) <= 80
-    plain = shown(state, pressed="", ascii_only=True)
+    assert max(map(len, shown(state).splitlines())) <= 80
+    plain = shown(state, ascii_only=True)
     assert set(plain) - {"±", "…"} <= set(map(chr, range(10, 127)))
 
 

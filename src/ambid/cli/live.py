@@ -5,17 +5,15 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -33,10 +31,8 @@ if TYPE_CHECKING:
 
 Flag = Literal["track", "hold", "accept", "revert"]
 
-_FLAGS: dict[str, Flag] = {"h": "hold", "t": "track", "a": "accept", "r": "revert"}
 _FRAME_S = 0.1  # between two pictures at the least
 _SHARE = 0.02  # of the time may go into drawing
-_SLICE_S = 0.05  # after which the drawing thread looks whether the run has ended
 
 
 class Stopped(KeyboardInterrupt):
@@ -70,8 +66,6 @@ class Follower:
         self._writer = None if target is None else TrackWriter(target)
         self._live = sys.stderr.isatty() and (self.table or not sys.stdout.isatty())
         self._keep, self._real_time = keep, real_time
-        self._flags: deque[Flag] = deque()
-        self._pressed = ""
         self._stop: int | None = None
         self._begin_wall = 0.0
         self._before_header = ExitStack()
@@ -182,13 +176,10 @@ class Follower:
         self._begin_wall = time.perf_counter()
         self.state = LiveState(header)
         if self._live:
-            self._picture = _Picture(self._view, self._key)
+            self._picture = _Picture(self._view)
 
-    def on_line(self, line: TrackLine) -> Sequence[Flag] | None:
-        """Take a line: written, counted and kept; drawing looks at it later.
-
-        Returns flags that the operator has set since the last line.
-        """
+    def on_line(self, line: TrackLine) -> None:
+        """Take a line: written, counted and kept; drawing looks at it later."""
         assert self.state is not None
         if self._writer is not None:
             if not self._writer.begun:
@@ -201,9 +192,6 @@ class Follower:
             self.history.add(line)
         if self._stop is not None:
             raise Stopped(self._stop)
-        if not self._flags:
-            return None
-        return [self._flags.popleft() for _ in range(len(self._flags))]
 
     def on_lag(self, lag_s: float) -> None:
         """Take the time from the last sample of a block to the end of its work."""
@@ -217,15 +205,7 @@ class Follower:
             raise KeyboardInterrupt
         self._stop = 128 + number
 
-    def _key(self, key: str) -> None:
-        if key == "q":
-            self._stop = 0
-            self._pressed = "end"
-        elif key in _FLAGS:
-            self._flags.append(_FLAGS[key])
-            self._pressed = _FLAGS[key]
-
-    def _view(self, keys: bool, ascii_only: bool) -> Group | None:
+    def _view(self, ascii_only: bool) -> Group | None:
         """Draw what is shown now; None before the first line. Called by the drawing thread."""
         from ambid.report.track import live_view
 
@@ -236,16 +216,14 @@ class Follower:
         behind = state.lag_s
         if behind is None and self._real_time:
             behind = wall - (state.line.t - state.begin_s)
-        pressed = self._pressed if keys else None
-        return live_view(state, wall_s=wall, behind_s=behind, pressed=pressed, ascii_only=ascii_only)
+        return live_view(state, wall_s=wall, behind_s=behind, ascii_only=ascii_only)
 
 
 class _Picture:
-    """The thread that draws the live view and reads keys."""
+    """The thread that draws the live view."""
 
-    def __init__(self, view: Callable[[bool, bool], Group | None], key: Callable[[str], None]) -> None:
-        self._view, self._key = view, key
-        self._done = Signal()
+    def __init__(self, view: Callable[[bool], Group | None]) -> None:
+        self._view, self._done = view, Signal()
         self._failure: Exception | None = None
         self._thread = Thread(target=self._run, name="live view", daemon=True)
         self._thread.start()
@@ -270,97 +248,11 @@ class _Picture:
         ascii_only = console.options.ascii_only
         # standard output is left alone: lines of JSON may go there
         shown = Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False, redirect_stderr=False)
-        with Keys() as keys, shown as live:
+        with shown as live:
             wait_s = 0.0
-            while not self._wait(keys, wait_s):
+            while not self._done.wait(wait_s):
                 begin = time.perf_counter()
-                view = self._view(keys.available, ascii_only)
+                view = self._view(ascii_only)
                 if view is not None:
                     live.update(view, refresh=True)
                 wait_s = max(_FRAME_S, (time.perf_counter() - begin) / _SHARE)
-
-    def _wait(self, keys: Keys, seconds: float) -> bool:
-        """Take keys until it is time for the next picture; True when the run has ended."""
-        until = time.perf_counter() + seconds
-        while not self._done.is_set():
-            left = until - time.perf_counter()
-            if left <= 0:
-                return False
-            for key in keys.read(min(left, _SLICE_S)):
-                self._key(key)
-        return True
-
-
-class Keys:
-    """Standard input read key by key, where it is a terminal in whose foreground this program runs.
-
-    Ctrl-C stays what it is. Elsewhere (a pipe, the background, a system without such terminals) there are no keys.
-
-    `fd`: file descriptor of the terminal; standard input by default.
-    """
-
-    def __init__(self, fd: int | None = None) -> None:
-        """Look whether there is a terminal; nothing is changed yet."""
-        self._fd = _standard_input() if fd is None else fd
-        self._before: list[Any] | None = None
-
-    @property
-    def available(self) -> bool:
-        """Whether keys can be read now."""
-        return self._before is not None
-
-    def __enter__(self) -> Self:
-        if self._fd is None or not _foreground(self._fd):
-            return self
-        import termios
-        import tty
-
-        self._before = termios.tcgetattr(self._fd)
-        tty.setcbreak(self._fd)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._before is not None and self._fd is not None:
-            import termios
-
-            before, self._before = self._before, None
-            termios.tcsetattr(self._fd, termios.TCSADRAIN, before)
-
-    def read(self, wait_s: float) -> str:
-        """Wait for a key.
-
-        `wait_s`: longest time to wait, s. Returns what was pressed, several keys perhaps; empty where nothing was.
-        """
-        if self._before is None or self._fd is None:
-            time.sleep(wait_s)
-            return ""
-        import select
-
-        ready, _, _ = select.select([self._fd], [], [], wait_s)
-        if not ready:
-            return ""
-        data = os.read(self._fd, 64)
-        if not data:  # the terminal has gone: waiting for it again would return at once
-            time.sleep(wait_s)
-        return data.decode("ascii", "ignore")
-
-
-def _standard_input() -> int | None:
-    try:
-        fd = sys.stdin.fileno()
-    except (AttributeError, OSError, ValueError):
-        return None
-    return fd if os.isatty(fd) else None
-
-
-def _foreground(fd: int) -> bool:
-    """Say whether the terminal's settings may be changed: a program in the background would be stopped for it."""
-    try:
-        import termios
-
-        termios.tcgetattr(fd)
-        return os.tcgetpgrp(fd) == os.getpgrp()
-    except (ImportError, OSError, AttributeError):
-        return False
-    except termios.error:
-        return False

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ambid.tracking.lines_file import LiveState
 
 STATE_STYLES = {"tracking": "bold green", "changed": "bold red", "hold": "bold cyan", "frozen": "bold yellow"}
-KEYS = "h hold   t track   a accept   r revert   q end"
 _BLOCKS, _PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*%#"
 _BAD = ("change", "reverted", "refused", "disturbed")
 _MOST = 20  # events that are listed one by one
@@ -211,15 +210,11 @@ def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> s
 Parts = list[str | tuple[str, str]]  # of a line, those with a style of their own as pairs
 
 
-def live_view(
-    state: LiveState, *, wall_s: float, behind_s: float | None = None, pressed: str | None = None,
-    ascii_only: bool = False,
-) -> Group:  # fmt: skip
+def live_view(state: LiveState, *, wall_s: float, behind_s: float | None = None, ascii_only: bool = False) -> Group:
     """Make what is shown of a run that has a line.
 
-    `wall_s`: since tracking began, s; `behind_s`: from a sample to what is decided on it in real time, s; `pressed`:
-    the flag that the operator set last, None where there are no keys; `ascii_only`: for a terminal whose encoding has
-    no blocks. Returns about 80 columns wide.
+    `wall_s`: since tracking began, s; `behind_s`: from a sample to what is decided on it in real time, s; `ascii_only`:
+    for a terminal whose encoding has no blocks. Returns about 80 columns wide.
     """
     from rich.console import Group
     from rich.text import Text
@@ -227,8 +222,6 @@ def live_view(
     line = state.line
     assert line is not None
     after = [_error(state, line, ascii_only), _counts(state, line, wall_s), *_decisions(state)]
-    if pressed is not None:
-        after += [[], [(f"keys: {KEYS}{f'   (pressed: {pressed})' if pressed else ''}", "dim")]]
     head = _head(state, line, behind_s, ascii_only)
     first, *rest = (Text.assemble(*x, no_wrap=True, overflow="ellipsis") for x in (head, *after))
     return Group(first, Text(), _parameters(state, line, ascii_only), Text(), *rest)
