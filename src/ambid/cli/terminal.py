@@ -91,15 +91,6 @@ def progress(title: str) -> Iterator[Tick]:
         display.stop()
 
 
-def _bar(width: int) -> Bar:
-    """Make a bar on standard error between what is done and a text; it is taken away at the end."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=width), TextColumn("{task.fields[text]}"))
-    return Progress(*columns, console=Console(stderr=True), transient=True)
-
-
 class _Display:
     """A line of progress, drawn by a thread of its own so that it also lives while loops are compiled.
 
@@ -127,14 +118,12 @@ class _Display:
     def _show(self) -> None:
         if self._done.wait(_QUIET_S):
             return
-        with _bar(40) as bar:
-            task = bar.add_task(self._stage, total=None, text="")
+        with watching(40) as watch:
             while not self._done.wait(0.1):
                 elapsed, share = time.monotonic() - self._begin, self._share
                 text = f"{elapsed:.0f} s" + (f", {100 * share:.0f} %" if self._told else "")
                 text += f", {in_words(elapsed * (1.0 - share) / share)}" if share else ""
-                total = 1.0 if share else None
-                bar.update(task, total=total, completed=share, description=self._stage, text=text)
+                watch.show(self._stage, share or None, text)
 
 
 def in_words(seconds: float) -> str:
@@ -147,24 +136,31 @@ def in_words(seconds: float) -> str:
 class Watch:
     """Shows a bar and a text on standard error; silent where that is no terminal. Made by `watching`."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int) -> None:
         """Show nothing yet."""
+        self._width = width
         self._bar: Bar | None = None
         self._task: TaskID | None = None
 
-    def show(self, title: str, part: float, text: str) -> None:
+    def show(self, title: str, part: float | None, text: str) -> None:
         """Show how far it is.
 
-        `title`: what is done; `part`: 0 to 1; `text`: what is to be seen of it, short.
+        `title`: what is done; `part`: 0 to 1, None: not known; `text`: what is to be seen of it, short.
         """
         if not sys.stderr.isatty():
             return
         if self._bar is None:
-            self._bar = _bar(20)
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            bar = BarColumn(bar_width=self._width)
+            columns = (TextColumn("{task.description}"), bar, TextColumn("{task.fields[text]}"))
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._bar.start()
-            self._task = self._bar.add_task(title, total=1.0, text=text)
+            self._task = self._bar.add_task(title, total=None, text=text)
         assert self._task is not None
-        self._bar.update(self._task, completed=part, description=title, text=text)
+        total = None if part is None else 1.0
+        self._bar.update(self._task, total=total, completed=part or 0.0, description=title, text=text)
 
     def clear(self) -> None:
         """Take the line away, so that something else can be written."""
@@ -174,12 +170,12 @@ class Watch:
 
 
 @contextmanager
-def watching() -> Iterator[Watch]:
-    """Show a line while something runs.
+def watching(width: int = 20) -> Iterator[Watch]:
+    """Show a line while something runs, with a bar of some letters.
 
     Returns to be told how far it is; taken away at the end, whatever happens.
     """
-    watch = Watch()
+    watch = Watch(width)
     try:
         yield watch
     finally:

@@ -37,7 +37,6 @@ class Setting:
     argument: bool = False  # given by its place
     long: str = ""  # its word in a shell where that is not made from the name, without dashes
     short: str = ""  # another word for it in a shell, without dashes
-    label: str = ""  # of the console's field
 
     @property
     def flag(self) -> str:
