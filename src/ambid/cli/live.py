@@ -35,15 +35,6 @@ _FRAME_S = 0.1  # between two pictures at the least
 _SHARE = 0.02  # of the time may go into drawing
 
 
-class Stopped(KeyboardInterrupt):
-    """The operator ended a run that has begun to give lines."""
-
-    def __init__(self, code: int) -> None:
-        """Keep the exit `code`."""
-        super().__init__("stopped")
-        self.code = code
-
-
 class Follower:
     """Follows one run.
 
@@ -92,7 +83,7 @@ class Follower:
                     raise
                 if self.state is None:
                     raise
-                self.code = error.code if isinstance(error, Stopped) else INTERRUPTED
+                self.code = self._stop or INTERRUPTED
             finally:
                 if self._picture is not None:
                     self._picture.end()
@@ -158,7 +149,7 @@ class Follower:
         """Take a sign of life from the job."""
         del done
         if self._stop is not None:
-            raise Stopped(self._stop)
+            raise KeyboardInterrupt
         if self.state is None:
             self._say(stage)
 
@@ -191,7 +182,7 @@ class Follower:
         if self.history is not None:
             self.history.add(line)
         if self._stop is not None:
-            raise Stopped(self._stop)
+            raise KeyboardInterrupt
 
     def on_lag(self, lag_s: float) -> None:
         """Take the time from the last sample of a block to the end of its work."""
