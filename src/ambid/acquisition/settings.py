@@ -41,7 +41,7 @@ from ambid.physics.loop import UNLIMITED, Interval, Loop
 from ambid.record import Channel, Record
 from ambid.record.calibration import Calibration
 from ambid.rig import bench_record
-from ambid.rig.rig import DAQ_RATE_HZ, Daq, Rig, RigChannel
+from ambid.rig.rig import DAQ_RATE_HZ, Daq, Rig, RigChannel, role_units
 from ambid.tracking.blocks import Block
 
 GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
@@ -186,8 +186,6 @@ def held_by(rig: Rig, loop: Loop) -> Loop:
     """
     if rig.daq is None or rig.rotor is not None:
         return loop
-    from ambid.acquisition.settings import with_default_daq
-
     full = replace(with_default_daq(rig), loop=loop)
     return replace(realised(controller_settings(full), full), delay=loop.delay)
 
@@ -390,8 +388,6 @@ def _si_scale(rig: Rig, settings: ControllerSettings, role: str) -> Scale | None
 
 
 def _unit(rig: Rig, role: str) -> str:
-    from ambid.rig.rig import role_units
-
     third = _third_role(rig) if role == "extra" else None
     return role_units(model(rig.model)).get(third or role, "1")
 

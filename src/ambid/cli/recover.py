@@ -9,7 +9,7 @@ import typer
 from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, DeviceError
 
 
 @verb("recover")
@@ -46,7 +46,6 @@ def _recover(journal: Path, output: Path | None, outputs: Outputs, *, delete: bo
     """
     from ambid.acquisition.recorder import JournalReader, record_path, recorded_already, recorded_from
     from ambid.acquisition.recorder.journal import sync_folder
-    from ambid.errors import DeviceError
 
     if not journal.name:
         raise AmbidError(f"journal {str(journal)!r} is a folder; it must be a file. Name the file inside it")

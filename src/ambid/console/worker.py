@@ -31,7 +31,7 @@ from ambid.console.rotor_view import Orbits, loop_content
 from ambid.console.runs import MOVING, Heard, Run, size_of, usual_times
 from ambid.console.words import PAGE_WORDS, RIG_WORDS
 from ambid.errors import AmbidError
-from ambid.record.record import INSIDE
+from ambid.record.record import INSIDE, cut
 from ambid.settings.caller import speaking
 
 if TYPE_CHECKING:
@@ -360,7 +360,6 @@ def _design(worker: Worker) -> None:
 def _export(worker: Worker) -> None:
     """Write a stretch of a record as a record."""
     from ambid.record import read_record, write_record
-    from ambid.record.record import cut
 
     path, out = worker.named("record"), worker.folder / str(worker.spec["out"])
     record = cut(read_record(path, gaps="interpolate"), float(worker.spec["from_s"]), float(worker.spec["to_s"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ambid.acquisition.device import Device
-from ambid.acquisition.devices.played import Pace
+from ambid.acquisition.devices.played import Pace, ReplayDevice
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
@@ -49,8 +49,6 @@ def open_device(
 
         return SimulatedDevice(rig, bench=bench, pace=pace, seed=seed)
     if port.startswith(REPLAY):
-        from ambid.acquisition.devices.played import ReplayDevice
-
         name = port.removeprefix(REPLAY)
         if not name.strip():
             raise DeviceError(f"port {port!r} names no record. Give {REPLAY}FILE")
