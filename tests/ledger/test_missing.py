@@ -91,6 +91,16 @@ def test_a_bearing_of_which_every_record_failed_is_watched_too(ledger):
     assert {s.bearing: s.failures for s in found.states} == {"worn": 0, "new": 3}
 
 
+def test_a_bearing_that_failed_once_and_went_silent_is_told(ledger):
+    failure = Failure(bearing="new", record="0.h5", sha="0", rig_sha="", settings="", version="1",
+                      reason="it has a gap", failed_at=BEGIN)  # fmt: skip
+    told = [
+        [a.cause for a in look(ledger, BEGIN + days * DAY, failures=[failure]).open if a.bearing == "new"]
+        for days in (91, 93)
+    ]
+    assert told == [[], ["never an estimate, and no record for 93 days; the last one failed: it has a gap"]]
+
+
 def test_metrics_and_messages_give_no_old_value_a_fresh_time(ledger, tmp_path):
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is not installed")
     ledger.add([entry(k, "worn", verdict="unusable", parameters=(parameter("k_i", 1.0, 0.1),)) for k in range(30, 60)])

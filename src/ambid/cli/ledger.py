@@ -58,11 +58,10 @@ def restore(v: Values) -> None:
     What it holds now is backed up first into --out, by which this is undone.
     """
     from ambid.ledger import open_ledger
-    from ambid.ledger.store import readable
 
     if v.out is not None and v.out.resolve() == Path(v.other).resolve():
         raise AmbidError(f"{setting('out', v.out)} is read from. Give another file")
-    with readable(v.other), open_ledger(v.ledger) as ledger:
+    with open_ledger(v.other, write=False), open_ledger(v.ledger) as ledger:
         known = bool(ledger.bearings() or ledger.corrections())
         if known and v.out is None:
             raise AmbidError(
@@ -84,9 +83,8 @@ def merge(v: Values) -> None:
     An estimate that both have stays as it is; the other ledger stays as it was. An archive comes back by this too.
     """
     from ambid.ledger import open_ledger
-    from ambid.ledger.store import readable
 
-    with readable(v.other), open_ledger(v.ledger) as ledger:
+    with open_ledger(v.other, write=False), open_ledger(v.ledger) as ledger:
         done = ledger.merge(v.other, who=v.who or "", why=v.why or "")
         typer.echo(f"{ledger.shown}: {done.text}. Undo: {command('history', ledger=ledger.shown, undo=done.number)}")
 

@@ -185,6 +185,17 @@ def unusable(
         )  # fmt: skip
 
 
+def never(bearing: str, rule: RecordRule, failures: Sequence[Failure], now: float) -> Iterator[Alarm]:
+    """Yield alarms about a bearing that has given no estimate yet: its records fail, or none has come for long."""
+    yield from unusable(bearing, rule, (), failures, now)
+    at = np.array(sorted(f.failed_at for f in failures))
+    overdue = pauses(at, rule).overdue_s
+    if now - at[-1] > overdue:
+        reason = max(failures, key=lambda f: f.failed_at).reason
+        text = f"never an estimate, and no record for {span(now - at[-1])}; the last one failed: {reason}"
+        yield alarm_of(bearing, "stale", float(at[-1]), now, text, raised=float(at[-1] + overdue))
+
+
 def _unseen(h: History, s: Series, rule: RecordRule, now: float) -> Iterator[Alarm]:
     """Yield where usable estimates came, and none showed a parameter."""
     seen = set(s.estimate[np.isfinite(s.value)].tolist())

@@ -19,7 +19,7 @@ from ambid.ledger.alarm import Alarm, Silence
 from ambid.ledger.causes import cause_of
 from ambid.ledger.history import History, Series
 from ambid.ledger.misnamed import misnamed
-from ambid.ledger.missing import missing, of_one_bearing, pauses, plausible, unusable
+from ambid.ledger.missing import missing, never, of_one_bearing, pauses, plausible
 from ambid.ledger.rules import BUILT_IN, RecordRule, Rule
 from ambid.ledger.trends import (
     FEW,
@@ -168,7 +168,7 @@ def watch(
         n = len(failed[name])
         states.append(Now(bearing=name, verdict="", latest=None, success=None, overdue_s=math.nan, failures=n))
         if (rule := records.get(name, records.get(""))) is not None:
-            alarms += unusable(name, rule, (), failed[name], now)
+            alarms += never(name, rule, failed[name], now)
     if records:
         alarms += misnamed(bearings, now)
         alarms = list(of_one_bearing(alarms, bearings))

@@ -9,7 +9,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,9 +50,6 @@ def server_engine(url: str) -> tuple[Engine, str]:
 
 def file_engine(path: Path, *, write: bool, make: bool) -> tuple[Engine, str]:
     """Return the engine of a file of SQLite, and its name; refuse what is none, untouched."""
-    from sqlalchemy import create_engine, event
-    from sqlalchemy.pool import StaticPool
-
     name = str(path)
     new = not path.exists() or path.stat().st_size == 0
     if path.is_dir() or (path.exists() and not path.is_file()):
@@ -72,13 +69,33 @@ def file_engine(path: Path, *, write: bool, make: bool) -> tuple[Engine, str]:
             connection.execute("PRAGMA journal_mode = WAL")
         return connection
 
+    return _engine_of(connect), name
+
+
+def copied_engine(path: Path) -> Engine:
+    """Return the engine of a copy of a file of SQLite, which is gone when it is closed."""
+    import sqlite3
+
+    def connect() -> Any:
+        copy = sqlite3.connect("", isolation_level=None, check_same_thread=False)
+        with closing(_read_only(path, PATIENCE_S)) as original:
+            original.backup(copy)
+        return copy
+
+    return _engine_of(connect)
+
+
+def _engine_of(connect: Callable[[], Any]) -> Engine:
+    from sqlalchemy import create_engine, event
+    from sqlalchemy.pool import StaticPool
+
     engine = create_engine("sqlite://", creator=connect, poolclass=StaticPool)
 
     @event.listens_for(engine, "begin")
     def begin(c: Connection) -> None:
         _patiently(lambda: c.exec_driver_sql("BEGIN" if c.get_execution_options().get("reads") else "BEGIN IMMEDIATE"))
 
-    return engine, name
+    return engine
 
 
 def _patiently(do: Callable[[], object]) -> None:
@@ -182,8 +199,8 @@ def make_ready(engine: Engine, ledger: str, *, write: bool, make: bool) -> None:
             )
         if version < entry.VERSION and not write:
             raise OlderLedgerError(
-                f"ledger {ledger} is of version {version}, and is read as {entry.VERSION}. 'ambid ledger check' brings "
-                "it to that version"
+                f"ledger {ledger} is of version {version}, and is read as {entry.VERSION}. "
+                f"'ambid ledger check {ledger}' brings it to that version"
             )
         for step in range(version, entry.VERSION):
             for statement in entry.STEPS[step]:

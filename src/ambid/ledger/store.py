@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from ambid.errors import AmbidError, counted, needs
@@ -26,6 +25,7 @@ from ambid.ledger.entry import Correction, Entry, key_of
 from ambid.ledger.opening import (
     OlderLedgerError,
     check_file,
+    copied_engine,
     file_engine,
     in_one_line,
     make_ready,
@@ -427,7 +427,7 @@ class Ledger:
             return copying.restore(c0, c, source.shown, who=who, why=why)
 
     def retain(
-        self, archive: str | Path, *, before: float, keep: Keep = "none", who: str = "", why: str = ""
+        self, archive: str | Path, *, before: float, keep: Keep = "month", who: str = "", why: str = ""
     ) -> Correction:
         """Move what was taken before a time into an archive; `merge` of the archive brings it back.
 
@@ -440,7 +440,8 @@ class Ledger:
         before : float
             S since 1970, UTC.
         keep : str, optional
-            One usable estimate of each bearing, job and ``"day"``, ``"week"``, ``"month"`` or ``"year"`` stays.
+            One usable estimate of each bearing, job and ``"day"``, ``"week"``, ``"month"`` or ``"year"`` stays;
+            ``"none"``: none.
         who, why : str, optional
             Who does this, default the account, and for what reason.
 
@@ -568,7 +569,7 @@ class Ledger:
     @contextmanager
     def _sound(self, where: str | Path) -> Iterator[Ledger]:
         """Open another ledger to copy from; refuse one that is damaged."""
-        with readable(where) as source:
+        with open_ledger(where, write=False) as source:
             self._refuse_itself(source)
             wrong = source.check()
             if wrong:
@@ -650,7 +651,8 @@ def open_ledger(where: str | Path, *, write: bool = True, make: bool = True) -> 
     where : str or Path
         File of SQLite, or URL of PostgreSQL, ``postgresql://user@host/name``.
     write : bool, optional
-        False: nothing is written, and a ledger that is not there is refused.
+        False: nothing is written, and a ledger that is not there is refused; a file of an older version is read as a
+        copy that is brought to this one.
     make : bool, optional
         False: a ledger that is not there is refused, also for writing.
 
@@ -670,34 +672,18 @@ def open_ledger(where: str | Path, *, write: bool = True, make: bool = True) -> 
     ledger = Ledger(engine, name)
     try:
         with in_one_line(name):
-            make_ready(engine, name, write=write, make=write and make)
+            try:
+                make_ready(engine, name, write=write, make=write and make)
+            except OlderLedgerError:
+                if "://" in text:
+                    raise
+                ledger.close()
+                ledger = Ledger(copied_engine(Path(text)), name)
+                make_ready(ledger._engine, name, write=True, make=False)
     except BaseException:
         ledger.close()
         raise
     return ledger
-
-
-@contextmanager
-def readable(where: str | Path) -> Iterator[Ledger]:
-    """Open a ledger to copy from; a file of an older version is brought to this one in a copy, and stays as it is."""
-    try:
-        ledger = open_ledger(where, write=False)
-    except OlderLedgerError:
-        if "://" in str(where):
-            raise
-        import sqlite3
-
-        with TemporaryDirectory() as folder:
-            copy = Path(folder) / "copy.db"
-            old, new = sqlite3.connect(f"{Path(where).resolve().as_uri()}?mode=ro", uri=True), sqlite3.connect(copy)
-            old.backup(new)
-            old.close()
-            new.close()
-            with open_ledger(copy) as ledger:
-                yield ledger
-        return
-    with ledger:
-        yield ledger
 
 
 @contextmanager
