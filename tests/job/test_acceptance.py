@@ -13,12 +13,15 @@ from ambid.control.acceptance import PARTS, dynamic_stiffness
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.limits import vibration_limit
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, RigError
 from ambid.estimation.modes import EstimatedNumber
 from ambid.job.acceptance_items import Machine, _beside, _critical, _scaled
+from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
-from ambid.rig.rotor import Operation
+from ambid.rig.rig import RigMagnet
+from ambid.rig.rotor import Operation, operation_of
+from ambid.rig.schema import OperationEntry
 from ambid.rotor.passage import whirl_of
 from ambid.rotor.resonance import Peak, Resonance, Resonances
 from ambid.simulation.rotor_bench import RotorBench
@@ -208,6 +211,20 @@ def test_a_dead_sensor_is_refused(spindle):
         ambid.accept(replace(spindle.record, channels=dead), spindle.rig, estimate=spindle.estimate)
     with pytest.raises(EstimationError, match="has 1 samples; a rotor needs"):
         ambid.accept(spindle.record, spindle.rig, estimate=spindle.estimate, from_s=0.49991)
+
+
+def test_a_record_that_turns_is_not_taken_as_at_rest(spindle):
+    with pytest.raises(EstimationError, match=r"is given as at rest, and turns \d+ times by its own account"):
+        ambid.accept(spindle.record, spindle.rig, estimate=spindle.estimate, speed_rpm=0.0)
+
+
+def test_a_clearance_beyond_reason_is_refused(spindle):
+    wide = OperationEntry(touch_down={"value": 250.0, "unit": "mm"})
+    with pytest.raises(RigError, match=r"operation\.touch_down is 250 mm; no touch-down bearing leaves more than 5 mm"):
+        operation_of(wide, "rig.toml")
+    magnet = RigMagnet(kind="pair", parameters=(Parameter(name="s", unit="m", role="fixed", value=0.1e-3),))
+    with pytest.raises(EstimationError, match="200 um, wider than the air gap of the magnets, 100 um"):
+        ambid.accept(spindle.record, replace(spindle.rig, magnet=magnet), estimate=spindle.estimate)
 
 
 def test_a_record_of_another_machine_and_another_speed_is_told(spindle):

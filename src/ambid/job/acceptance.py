@@ -105,6 +105,7 @@ def accept(
             f"a machine is accepted on many axes; the rig's model is {bench.model!r}, of one axis. Give the rig of a "
             f"rotor, with [bearings.X], or use 'ambid margins'"
         )
+    _refuse_wide(bench)
     readings = read_records(sources_of(records), bench, speed_rpm, say, **reading)
     benches = benches_of(readings, bench.rotor)
     clock.lap("read")
@@ -127,6 +128,17 @@ def accept(
         result = _acceptance(Machine(of_machine, bench, benches), said, clock)
     clock.lap("items")
     return replace(result, timing_s=clock.laps, used=tuple(b.record for b in benches))
+
+
+def _refuse_wide(rig: Rig) -> None:
+    """Refuse a clearance that the air gap of the magnets does not leave."""
+    gap = None if rig.magnet is None else rig.magnet.known("s")
+    own = None if rig.operation is None else rig.operation.touch_down
+    if gap is not None and gap.value and own is not None and own > gap.value:
+        raise EstimationError(
+            f"operation.touch_down is {1e6 * own:.4g} um, wider than the air gap of the magnets, "
+            f"{1e6 * gap.value:.4g} um: the rotor would lie on them. Correct one of the two"
+        )
 
 
 def _acceptance(machine: Machine, warnings: list[str], clock: Clock) -> Acceptance:

@@ -57,6 +57,7 @@ from ambid.rotor.resonance import (
     separations,
 )
 from ambid.rotor.synchronous import Separated, separate
+from ambid.settings.caller import setting
 
 _RPM = 30.0 / math.pi
 _SECTORS, _ROUND = 8, 0.5  # directions; the least reach over the largest, of a rotor that is moved along its stops
@@ -102,6 +103,13 @@ def _bench(read: RotorRecord, model: RotorModel) -> Bench:
     if changes_speed(record):
         top = float(np.max(np.abs(turning_of(record).speed(record.rate_hz))))
         return Bench(record=record, name=read.name, kind="run-up", speed=top, apart=None)
+    if read.speed == 0.0 and not {"angle", "tacho", "speed"}.isdisjoint(record.names):
+        turns = float(np.ptp(turning_of(record).angle)) / (2.0 * np.pi)
+        if turns > 1.0:
+            raise EstimationError(
+                f"record {read.name} is given as at rest, and turns {turns:.4g} times by its own account. Correct "
+                f"{setting('speed_rpm')}, or omit it"
+            )
     apart = separate(record, model, read.speed)
     kind = "speed" if apart.response is not None else "rest"
     if kind == "rest" and apart.excitation is None and all(_reach(record, b.axes) for b in model.bearings):

@@ -38,6 +38,7 @@ TURN = 2.0 * math.pi
 _SPEEDS = {"rad/s": 1.0, "Hz": TURN}
 """SI units in which a speed may be given, and what makes rad/s of them."""
 _FASTEST = 1e6  # rad/s, ten million turns a minute
+_WIDEST = 5e-3  # m, clearance of a touch-down bearing
 _DISC = {"m": "kg", "Id": "kg m^2", "Ip": "kg m^2", "outer": "m", "inner": "m", "width": "m", "rho": "kg/m^3"}
 
 
@@ -239,6 +240,12 @@ def operation_of(entry: OperationEntry, where: str) -> Operation:
     wrong = next((name for name, x in values.items() if x <= 0.0), None)
     if wrong is not None:
         raise RigError(f"{place}.{wrong} is {values[wrong]:g}; it must be positive. Correct it")
+    wide = next((name for name in sizes if values.get(name, 0.0) > _WIDEST), None)
+    if wide is not None:
+        raise RigError(
+            f"{place}.{wide} is {1e3 * values[wide]:g} mm; no touch-down bearing leaves more than "
+            f"{1e3 * _WIDEST:g} mm. Correct its value or unit"
+        )
     if values.get("minimum_speed", 0.0) > values.get("maximum_speed", math.inf):
         raise RigError(f"{place}.minimum_speed is above maximum_speed. Correct one")
     return Operation(**values)
