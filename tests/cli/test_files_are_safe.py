@@ -35,7 +35,6 @@ VERBS = {
     "validate": ("validate", "e.json", "r.csv", "--json"),
     "fleet run": ("fleet", "run", "r.csv", "--ledger", "fleet.db", "--workers", "1", "--job", "info", "--taken-at",
                   "file", "--json"),
-    "fleet simulate": ("fleet", "simulate", "thesis", "--runs", "1", "--duration", "0.05", "--workers", "1", "--json"),
     "history": ("history", "A", "--ledger", "l.db", "--json"),
     "ledger backup": ("ledger", "backup", "l.db", "-o"),
     "ledger restore": ("ledger", "restore", "l.db", "l2.db", "-o"),

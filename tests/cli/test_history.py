@@ -96,28 +96,6 @@ def test_without_a_bearing_all_are_listed_with_what_failed(demo, ambid, monkeypa
     assert not (demo / "none.db").exists()
 
 
-def test_tables_are_exported_for_other_programs(demo, ambid, monkeypatch):
-    pandas = pytest.importorskip("pandas")
-    pytest.importorskip("pyarrow")
-    monkeypatch.chdir(demo)
-    with open_ledger("export.db") as ledger:
-        ledger.add([entry(k) for k in range(4)] + [entry(1, version="0.0.9"), entry(5, "B")])
-        ledger.remove("A", record="day3.h5")
-    for _ in range(2):  # what it wrote itself it writes again
-        assert ambid("history", "--ledger", "export.db", "--tables", "tables").code == 0
-    values, estimates = (pandas.read_parquet(demo / "tables" / f"{n}.parquet") for n in ("value", "estimate"))
-    joined = values.merge(estimates, left_on="estimate", right_on="id")
-    assert sorted(joined[joined.name == "k_i"].value) == [79.5, 79.8, 79.9, 80.0]
-    assert str(sorted(estimates.taken_at)[1]) == "2026-01-02 00:00:00+00:00"
-    assert values.identifiable.dtype == bool
-    assert ambid("history", "--ledger", "export.db", "--tables", "tables", "--all").code == 0
-    assert len(pandas.read_parquet(demo / "tables" / "estimate.parquet")) == 5
-    (demo / "tables" / "rig.parquet").unlink()
-    pandas.DataFrame({"x": [1]}).to_parquet(demo / "tables" / "rig.parquet")
-    done = ambid("history", "--ledger", "export.db", "--tables", "tables")
-    assert (done.code, "rig.parquet exists, and is not of a ledger" in done.err) == (2, True)
-
-
 def test_a_ledger_is_corrected_and_says_how_that_is_undone(demo, ambid, monkeypatch):
     monkeypatch.chdir(demo)
     with open_ledger("wrong.db") as ledger:

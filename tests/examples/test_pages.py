@@ -208,7 +208,7 @@ def test_the_page_on_the_ledger_runs(tmp_path, monkeypatch, capsys):
         assert run_verb(shlex.split(line)[1:]) == 0, line
     assert "pump 1: 2 estimates, 2026-03-02 06:00 to 2026-03-03 06:00 UTC" in capsys.readouterr().out
     exec(compile(blocks(page, "python")[0], "ledger.md", "exec"), {})
-    assert {"history.png", "history.html", "tables"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"history.png", "history.html"} <= {p.name for p in tmp_path.iterdir()}
 
 
 def test_the_page_on_fleets_runs(tmp_path, monkeypatch, capsys):

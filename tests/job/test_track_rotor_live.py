@@ -55,7 +55,7 @@ def test_every_axis_is_followed_with_its_sensitivity(start):
         zones = {axis: Zone.read(entry) for axis, entry in found.items()}
         assert {z.source for z in zones.values()} == {"measured"}
         for axis, zone in zones.items():
-            assert zone.peak_db == pytest.approx(start.sensitivity[axis]["peak_db"]["value"], abs=0.5)
+            assert zone.value == pytest.approx(start.sensitivity[axis]["peak_db"]["value"], abs=0.5)
 
 
 def test_a_loop_that_is_unstable_by_the_numbers_of_now_keeps_no_sensitivity_of_before(start, monkeypatch):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
 
-from ambid.fleet import monte_carlo
+import ambid
+from ambid.physics.presets import preset
+from ambid.rig import rig_of_preset
 from tests.bearing.benches import run
 from tests.estimation.kalman import cramer_rao_sd
 from tests.statistical.runs import EXCITATION_SEED, NAMES, many
@@ -96,14 +100,19 @@ def test_residual_tests_are_calibrated_under_feedback(runs, test):
 def test_what_is_not_given_is_found():
     # the whole job: delay searched, start values from the data alone
     n = number(60, short=16)
-    found = monte_carlo("unstable-bearing", runs=n, simulated={"duration": 0.2}, workers=1)
-    assert found.counts["failed"] == found.counts["unusable"] == 0
-    assert {r.name: (r.runs, r.unknown) for r in found.rows} == dict.fromkeys(("k_x", "k_i", "R", "L"), (n, 0))
-    for row in found.rows:
-        assert row.largest_z < 4.5
-        assert abs(row.bias) < 3.3 * row.bias_sd
-        assert row.inside >= 0.95 * n - 3.5 * np.sqrt(0.95 * 0.05 * n)
-        assert n.limit(0.7, centre=1) < row.said / row.spread < n.limit(1.4, centre=1)  # 60 runs know a spread to 9 %
+    rig = rig_of_preset(preset("unstable-bearing"))
+    truth = {p.name: p.value for p in rig.parameters if p.role == "free"}
+    known = replace(rig, parameters=tuple(replace(p, value=None) if p.name in truth else p for p in rig.parameters))
+    found = [ambid.identify(ambid.simulate(rig, duration=0.2, seed=k), known) for k in range(1, n + 1)]
+    assert {e.verdict.word for e in found} <= {"usable", "caution"}
+    for name, value in truth.items():
+        x, sd = np.array([(e[name].value - value, e[name].sd) for e in found]).T
+        assert all(e[name].identifiable for e in found)
+        assert np.max(np.abs(x / sd)) < 4.5
+        assert abs(x.mean()) < 3.3 * x.std(ddof=1) / np.sqrt(n)
+        assert np.sum(np.abs(x / sd) < 1.959964) >= 0.95 * n - 3.5 * np.sqrt(0.95 * 0.05 * n)
+        ratio = np.sqrt(np.mean(sd**2)) / x.std(ddof=1)  # 60 runs know a spread to 9 %
+        assert n.limit(0.7, centre=1) < ratio < n.limit(1.4, centre=1)
 
 
 def test_a_short_record_is_not_overconfident():

@@ -239,7 +239,7 @@ def loop_lines(t: float, sensitivity: Mapping[str, Any]) -> list[str]:
 
     zones = {axis: Zone.read(entry) for axis, entry in sensitivity.items()}
     lines = [
-        f"  {axis}  {z.peak_db:.2f} dB, 95 % within ± {NORMAL_95 * z.sd_db:.2f} dB, zone {z.words}, {z.source}"
+        f"  {axis}  {z.value:.2f} dB, 95 % within ± {NORMAL_95 * z.sd:.2f} dB, zone {z.words}, {z.source}"
         for axis, z in zones.items()
     ]
     return [f"sensitivity at {t:.4g} s, opened at the position:", *lines, ""] if lines else []

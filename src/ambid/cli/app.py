@@ -58,10 +58,9 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "export": "'ambid export ESTIMATE.json -o FILE', of what --json ESTIMATE.json wrote",
     },
     "console": {"key": "--certificate CERT,KEY"}, "export": {"to": "--library"},
-    "history": {"export": "--tables", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
+    "history": {"export": "", "tables": "", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
     "design controller": {"method": "--kind", "export": "--law", "judges": ""}, "design experiment": {"lines": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
-    "fleet simulate": {"limit": "--time-limit"},
     "acquire": {"no-live": "", "quiet": ""}, "track": {"start-seconds": "--start S", "no-live": "", "quiet": ""},
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
 }  # fmt: skip

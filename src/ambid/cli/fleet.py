@@ -1,4 +1,4 @@
-"""``ambid fleet``: a job on many records, and many simulated records of one rig."""
+"""``ambid fleet``: a job on many records."""
 
 from __future__ import annotations
 
@@ -13,13 +13,8 @@ from ambid.cli.options import Values, verb
 from ambid.cli.output import NOTHING, Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
-from ambid.estimation.result import Result
 
-group = typer.Typer(
-    rich_markup_mode=None,
-    no_args_is_help=False,
-    help="Do a job on many records, or judge it on many simulated ones.",
-)
+group = typer.Typer(rich_markup_mode=None, no_args_is_help=False, help="Do a job on many records.")
 
 
 @group.command("run", short_help="do a job on many records, each once")
@@ -47,40 +42,12 @@ def run(v: Values) -> None:
             )  # fmt: skip
         outputs.give(found)
     n = found.counts
-    _show(outputs, found, stop, strict=v.strict, failed=n["failed"], good=n["done"] + n["known"])
-
-
-@group.command("simulate", short_help="judge a job on many simulated records of a rig")
-@verb("fleet simulate")
-def simulate(v: Values) -> None:
-    """Judge a job on many simulated records: bias, spread, and how often 95 % intervals hold the truth.
-
-    The job gets the rig without the values of parameters that are free. Ctrl-C keeps what is done.
-    Exit codes as of 'ambid fleet run': 3 some runs failed, 4 all did.
-    """
-    from ambid.fleet.trials import monte_carlo
-
-    of_bench = v.only("duration amplitude") | {"nonlinear": v.nonlinear or None}
-    stop = Stop()
-    with Outputs(Path(v.rig) if Path(v.rig).is_file() else None, **v.outputs) as outputs:
-        with signals(stop.take), progress("fleet") as show:
-            found = monte_carlo(
-                v.rig, simulated={n: x for n, x in of_bench.items() if x is not None}, stopped=stop.wished, tick=show,
-                **v.only("runs seed job workers limit_s"), **_settings(v.set),
-            )  # fmt: skip
-        outputs.give(found)
-    failed = found.counts["failed"]
-    _show(outputs, found, stop, strict=v.strict, failed=failed, good=len(found.trials) - failed)
-
-
-def _show(outputs: Outputs, found: Result, stop: Stop, *, strict: bool, failed: int, good: int) -> None:
-    """Print what was found, and end with the code of the signal where one ended the work, or of what failed."""
     outputs.show(found)
-    if stop.wished():
+    if stop.wished():  # the code of the signal that ended the work
         raise typer.Exit(stop.code)
-    if failed and not good:
+    if n["failed"] and not n["done"] + n["known"]:
         raise typer.Exit(NOTHING)
-    end(failed=bool(failed) or (strict and not found.passed))
+    end(failed=bool(n["failed"]) or (v.strict and not found.passed))
 
 
 def _settings(words: list[str] | None) -> dict[str, Any]:

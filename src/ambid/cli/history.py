@@ -33,7 +33,7 @@ def _corrected(v: Values) -> bool:
     if len(changes) > 1:
         raise AmbidError(f"{' and '.join(map(setting, changes))} are {len(changes)} changes. Make them one by one")
     change = changes[0]
-    shown = "every export alarms acknowledge until publish json plot report strict"
+    shown = "every alarms acknowledge until publish json plot report strict"
     refuse_given(v.only(shown), f"{{}} is not for {setting(change)}")
     if change == "undo":
         refuse_given(v.only("bearing record"), "--undo takes a number alone. Omit {}")
@@ -82,8 +82,8 @@ def command(v: Values) -> None:
         rules = BUILT_IN if file is None else read_rules(file)
         if v.alarms is None:
             refuse_given(v.only("publish acknowledge"), "{} needs --alarms. Give it, or omit {}")
-            if v.bearing is None and v.export is None:
-                refuse_given(v.only("every"), "{} is for one bearing, or for --tables. Name it, or omit {}")
+            if v.bearing is None:
+                refuse_given(v.only("every"), "{} is for one bearing. Name it, or omit {}")
         else:
             refuse_given(v.only("every"), "{} is not for --alarms. Omit {}")
         if v.acknowledge is None:
@@ -96,8 +96,6 @@ def command(v: Values) -> None:
         if v.bearing is None and v.alarms is None:
             refuse_given(v.only("json plot report strict"), "{} is for one bearing. Name it, or omit {}")
         with open_ledger(v.ledger, write=v.acknowledge is not None, make=False) as found:
-            if v.export is not None:
-                typer.echo(f"{v.export} holds {', '.join(found.export(v.export, every=v.every))}", err=True)
             result: Result
             if v.alarms is not None:
                 names = [b.name for b in found.bearings()] if v.bearing is None else [v.bearing]

@@ -93,7 +93,7 @@ def loop_content(t: float, sensitivity: Mapping[str, Any]) -> Mapping[str, Any]:
         zone = Zone.read(entry)
         hz = entry["measured_frequency_hz"] if zone.source == "measured" else entry["frequency_hz"]
         axes[axis] = {
-            "db": zone.peak_db, "half": NORMAL_95 * zone.sd_db if math.isfinite(zone.sd_db) else None, "hz": hz,
+            "db": zone.value, "half": NORMAL_95 * zone.sd if math.isfinite(zone.sd) else None, "hz": hz,
             "zone": zone.words, "worst": zone.worst, "source": zone.source,
         }  # fmt: skip
     return {"t": round(t, 2), "axes": axes}

@@ -513,10 +513,10 @@ def _zone(sensitivity: Mapping[str, AxisSensitivity]) -> Check:
     axis, s = max(sensitivity.items(), key=lambda x: x[1].rating.upper_db)
     zone = s.rating
     hz = s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
-    peak = f"{zone.peak_db:.1f} dB at {hz:.3g} Hz (axis {axis}, {zone.source}), zone {zone.words}"
+    peak = f"{zone.value:.1f} dB at {hz:.3g} Hz (axis {axis}, {zone.source}), zone {zone.words}"
     good, doubt = zone.worst in LONG_TERM, " is not ruled out" * (zone.letters[0] in LONG_TERM)
     return Check(
-        passed=good, values={"peak_db": zone.peak_db, "upper_db": zone.upper_db},
+        passed=good, values={"peak_db": zone.value, "upper_db": zone.upper_db},
         detail=f"largest sensitivity {peak} of ISO 14839-3" if good else
         f"the largest sensitivity is {peak} of ISO 14839-3 (up to {zone.upper_db:.1f} dB): too little margin for "
         f"unrestricted operation{doubt}. Add damping around that frequency",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from ambid.estimation.result import NORMAL_95
 
@@ -33,19 +33,6 @@ def zone_of(value: float, limits: Sequence[float] = _DECIBELS) -> str:
     return next((zone for most, zone in zip(limits, "ABC", strict=True) if value < most), "D")
 
 
-class _Peak(NamedTuple):
-    decibel: float
-    sd: float  # dB; 0: nothing is said of it; inf: it is not known, nor is the zone
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        return self.decibel - NORMAL_95 * self.sd, self.decibel + NORMAL_95 * self.sd
-
-
-def _peak(decibel: float, sd: float) -> _Peak:
-    return _Peak(decibel, math.inf if math.isnan(sd) else sd)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grade:
     """A number between the limits of zones A, B and C, as far as it is known."""
@@ -60,14 +47,19 @@ class Grade:
         return cls(value=share, sd=sd, limits=tuple(most for most, _ in DISPLACEMENT))
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """The 95 % interval of the number."""
+        return self.value - NORMAL_95 * self.sd, self.value + NORMAL_95 * self.sd
+
+    @property
     def worst(self) -> str:
         """The zone of the upper end of the 95 % interval, by which a machine is accepted or not."""
-        return zone_of(_Peak(self.value, self.sd).ends[1], self.limits)
+        return zone_of(self.ends[1], self.limits)
 
     @property
     def letters(self) -> str:
         """``"A"``; where the 95 % interval holds a limit, ``"A or B"``, or ``"A to C"`` with one between."""
-        first = zone_of(_Peak(self.value, self.sd).ends[0], self.limits)
+        first = zone_of(self.ends[0], self.limits)
         if first == self.worst:
             return first
         return f"{first} {'or' if ord(self.worst) - ord(first) == 1 else 'to'} {self.worst}"
@@ -100,33 +92,28 @@ class Zone(Grade):
     source: Literal["measured", "predicted"]
 
     @classmethod
-    def of(cls, predicted: _Peak | tuple[float, float], measured: _Peak | tuple[float, float] | None = None) -> Zone:
+    def of(cls, predicted: tuple[float, float], measured: tuple[float, float] | None = None) -> Zone:
         """Judge the measured peak, (dB, sd), where there is one; the predicted one where it is surely higher (it may
-        stand where nothing was excited) or where the measured one has no sd and is lower.
+        stand where nothing was excited) or where the measured one has no sd and is lower. An sd of NaN is infinite.
         """
-        p, m = _peak(*predicted), None if measured is None else _peak(*measured)
-        if m is None or p.ends[0] > m.ends[1] or (m.sd == 0.0 and p.ends[1] > m.decibel):
-            return cls(value=p.decibel, sd=p.sd, source="predicted")
-        return cls(value=m.decibel, sd=m.sd, source="measured")
+        p = cls(value=predicted[0], sd=_known(predicted[1]), source="predicted")
+        if measured is None:
+            return p
+        m = cls(value=measured[0], sd=_known(measured[1]), source="measured")
+        return p if p.ends[0] > m.ends[1] or (m.sd == 0.0 and p.ends[1] > m.value) else m
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Zone:
         """Judge an axis of ``sensitivity`` as an estimate has it in JSON."""
         peak, measured = entry["peak_db"], entry["measured_peak_db"]
-        pair = None if measured is None else _Peak(measured, entry.get("measured_sd_db") or 0.0)
-        return cls.of(_Peak(peak["value"], math.inf if peak["sd"] is None else peak["sd"]), pair)
-
-    @property
-    def peak_db(self) -> float:
-        """The peak."""
-        return self.value
-
-    @property
-    def sd_db(self) -> float:
-        """Its standard deviation."""
-        return self.sd
+        pair = None if measured is None else (measured, entry.get("measured_sd_db") or 0.0)
+        return cls.of((peak["value"], math.inf if peak["sd"] is None else peak["sd"]), pair)
 
     @property
     def upper_db(self) -> float:
         """The upper end of the peak's 95 % interval."""
-        return _Peak(self.peak_db, self.sd_db).ends[1]
+        return self.ends[1]
+
+
+def _known(sd: float) -> float:
+    return math.inf if math.isnan(sd) else sd

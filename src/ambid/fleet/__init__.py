@@ -1,4 +1,4 @@
-"""Any job on many records: a pool of processes or a cluster, each record once; Monte Carlo over a rig.
+"""Any job on many records: a pool of processes or a cluster, each record once.
 
 The room itself is the function `ambid.fleet`: ``ambid.fleet(records, rigs, job=...)``.
 """
@@ -13,9 +13,6 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.fleet.run import fleet as fleet
-    from ambid.fleet.trials import monte_carlo as monte_carlo
-    from ambid.validation.coverage import Coverage as Coverage
-    from ambid.validation.coverage import Covered as Covered
 
 _exported, __dir__, __all__ = exports(__name__)
 

@@ -260,17 +260,23 @@ class _Run:
                 task = self._keyed(at, item) if item is not None else None
                 if task is not None:
                     some.append(task)
-            known = ledger.documents(task.key for task in some)
-            for task in some:
+            for task in self._told(ledger, some, {} if self._again else self._failed):
                 self._reached = task.at
-                before = None if self._again else self._failed.get(task.key)
-                if task.key in known:
-                    self.put(task.at, task.item, "known", **self.kept(*known[task.key]))
-                elif before is not None:
-                    self.put(task.at, task.item, "failed", reason=before.reason)
-                else:
-                    yield task
-                self._like(task.at)
+                yield task
+
+    def _told(self, ledger: Ledger, some: Sequence[_Task], failed: Mapping[str, Failure]) -> list[_Task]:
+        """Put down the records whose result the ledger has, or which are among the failed ones; return the others."""
+        known, left = ledger.documents(task.key for task in some), list[_Task]()
+        for task in some:
+            if task.key in known:
+                self.put(task.at, task.item, "known", **self.kept(*known[task.key]))
+            elif task.key in failed:
+                self.put(task.at, task.item, "failed", reason=failed[task.key].reason)
+            else:
+                left.append(task)
+                continue
+            self._like(task.at)
+        return left
 
     def _keyed(self, at: int, item: Item) -> _Task | None:
         """Return a record with its key; None where it cannot be read, or another one holds the same."""
@@ -313,20 +319,9 @@ class _Run:
             return []
         assert self.ledger is not None
         assert self._leases is not None
-        known, left, over = self.ledger.documents(task.key for task in some), list[_Task](), list[str]()
-        failed = self.ledger.failures(task.key for task in some if task.key not in known)
-        for task in some:
-            before, now = self._failed.get(task.key), failed.get(task.key)
-            if task.key in known:
-                self.put(task.at, task.item, "known", **self.kept(*known[task.key]))
-            elif now is not None and now != before:
-                self.put(task.at, task.item, "failed", reason=now.reason)
-            else:
-                left.append(task)
-                continue
-            over.append(task.key)
-            self._like(task.at)
-        self._leases.release(over)
+        now = self.ledger.failures(task.key for task in some)
+        left = self._told(self.ledger, some, {k: f for k, f in now.items() if f != self._failed.get(k)})
+        self._leases.release({task.key for task in some} - {task.key for task in left})
         return left
 
     def alive(self) -> None:

@@ -282,7 +282,7 @@ def _sensitivity(machine: Machine, margins: Mapping[str, Margins]) -> Iterator[I
             zone = s.rating
             hz = s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
             yield _item(
-                "sensitivity", f"axis {axis}, {name}", zone.peak_db, zone.sd_db, "dB",
+                "sensitivity", f"axis {axis}, {name}", zone.value, zone.sd, "dB",
                 f"zone {zone.words}, {zone.source}, at {hz:.4g} Hz",
                 outcome="reported" if s.measured is None else outcome_of_zone(zone),
                 limit=20.0 * math.log10(ZONES[1][0]), limits="sensitivity",

@@ -435,7 +435,7 @@ def identification(
         why = "; ".join(w for w in estimate.warnings if "sensitivity" in w) or "[loop] and the estimate do not agree"
         reasons.append(f"the sensitivity at the position is not known, and the loop cannot be judged: {why}")
     for zone in map(Zone.read, estimate.sensitivity.values()):
-        numbers |= {"sensitivity_db": zone.peak_db, "sensitivity_upper_db": zone.upper_db}
+        numbers |= {"sensitivity_db": zone.value, "sensitivity_upper_db": zone.upper_db}
         against, notes = _by_zone(zone, "" if plan.redesign else _offer(simulated=simulated))
         remedy = "design a better loop, and load that" if against and not reasons else ""
         reasons, cautions = [*reasons, *against], [*cautions, *notes, *_untested(margins)]
@@ -460,7 +460,7 @@ def _by_zone(zone: Zone, offer: str) -> tuple[list[str], list[str]]:
     """Return what a loop is refused and warned for by the upper end of its peak's 95 % interval; `offer`: the remedy of
     a warning.
     """
-    size = f"{pure(zone.peak_db, zone.sd_db)} dB, at most {zone.upper_db:.2f} dB (95 %)"
+    size = f"{pure(zone.value, zone.sd)} dB, at most {zone.upper_db:.2f} dB (95 %)"
     text = f"the sensitivity at the position, {zone.source} {size}, is in zone {zone.words} of ISO 14839-3"
     if zone.worst in LONG_TERM:
         return [], [] if zone.worst == "A" else [f"{text}: new machines are to be in zone A{offer}"]

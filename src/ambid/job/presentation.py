@@ -391,6 +391,5 @@ _KINDS: Mapping[str, Kind] = {
     "History": _whole("history.history_document", "history"),
     "Watched": _whole("history.watch_document", "alarms"),
     "FleetRun": _whole("fleet.fleet_document", "fleet"),
-    "Coverage": _whole("fleet.coverage_document", "coverage"),
 }
 """By the name of the result's class: what shows it is imported when one is shown."""

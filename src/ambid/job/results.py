@@ -156,7 +156,6 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.design/1": _whole("control.design", "Design", "design_controller"),
     "ambid.history/1": _whole("ledger.history", "History", "history"),
     "ambid.commission/1": _whole("job.commissioning", "Commissioned", "commission"),
-    "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet_simulate"),
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
     "ambid.agreement/1": _whole("validation.agreement", "Agreement", "compare"),
     "ambid.acceptance/1": _whole("control.acceptance", "Acceptance", "accept"),

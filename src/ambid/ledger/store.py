@@ -1,4 +1,4 @@
-"""The ledger itself, SQLite or PostgreSQL: opened, written, asked, and written to Parquet. One batch is one
+"""The ledger itself, SQLite or PostgreSQL: opened, written and asked. One batch is one
 transaction, of which a kill or a full disk leaves nothing; two may write at once, and an estimate that both have counts
 once.
 """
@@ -500,33 +500,6 @@ class Ledger:
         """
         with self._reading() as c:
             return {e.key: e for e in correcting.stored_by_key(c, keys)}
-
-    def export(self, folder: str | Path, *, every: bool = False) -> tuple[str, ...]:
-        """Write the tables as Parquet files, for DuckDB or pandas; needs the extra ``ambid[formats]``.
-
-        Of each record and job stands there what counts in a history.
-
-        Parameters
-        ----------
-        folder : str or Path
-            Made where there is none; a table that is there is replaced only where this wrote it.
-        every : bool, optional
-            Also estimates that another one supersedes.
-
-        Returns
-        -------
-        tuple of str
-            Names of the files.
-
-        Raises
-        ------
-        AmbidError
-            If pyarrow is not installed, or the folder cannot be written.
-        """
-        from ambid.ledger.parquet import export
-
-        with self._reading() as c:
-            return export(c, Path(folder), every=every)
 
     # --- inside -----------------------------------------------------------------------------------------------------
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from ambid.errors import counted, listed
 from ambid.report.document import Document, Lines, Section, grid, value_columns
-from ambid.report.drawing import BAND, BOUND, MEASURED, PREDICTED, Block, head, panel, said_panel, stacked
-from ambid.report.numbers import prefixed, quantity, sized
+from ambid.report.drawing import BOUND, MEASURED, Block, head, panel, said_panel, stacked
+from ambid.report.numbers import prefixed, sized
 from ambid.report.text import WORDS, Line
 from ambid.settings.caller import setting
-from ambid.validation.coverage import Coverage, Covered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,85 +109,3 @@ def _strip(axes: Axes, fleet: FleetRun, name: str) -> None:
     head(axes, f"{name}: {counted(len(at), 'record')}")
     axes.set_ylabel(f"{name} [{unit}]")
     axes.set_xlabel("record")
-
-
-_MOST_REASONS = 5
-
-
-def coverage_title(coverage: Coverage) -> str:
-    """Return what was done, in a few words."""
-    return f"{coverage.job} of {counted(len(coverage.trials), 'simulated record')} of {coverage.rig}"
-
-
-def coverage_document(coverage: Coverage, _: Any) -> Document:
-    """Describe a Monte Carlo over a rig."""
-    c, title = coverage, coverage_title(coverage)
-    columns: dict[str, list[object]] = {n: [getattr(t, n) for t in c.trials] for n in ("seed", "verdict", "reason")}
-    return Document(
-        title=title, sections=coverage_sections(c), figure=partial(coverage_figure, c, title),
-        frame=lambda: ("seed", columns | value_columns(c.trials, c.truth)),
-    )  # fmt: skip
-
-
-def coverage_sections(coverage: Coverage) -> list[Section]:
-    """Say bias, spread and coverage of each parameter."""
-    c, n = coverage, coverage.counts
-    failed = [f"{n['failed']} failed"] * bool(n["failed"])
-    words = ", ".join([*(f"{n[w]} {WORDS[w][0]}" for w in WORDS if n[w]), *failed])
-    head: list[Line] = [[(coverage_title(c), "strong"), f": {words}"], f"{c.seconds:.3g} s"]
-    rows: list[tuple[str, ...]] = [
-        ("", "truth", "mean ± sd of it", "bias/sd", "sd said/seen", "95 % hold", "(95 %)", "max |z|")
-    ]
-    rows += [_row(r, c.units.get(r.name, "")) for r in c.rows]
-    reasons = Counter(t.reason for t in c.trials if t.reason).most_common(_MOST_REASONS)
-    return [
-        Section(parts=[Lines(lines=head, indent=2)]),
-        Section(title="Parameters", parts=[grid(rows)]),
-        Section(
-            heading=[("failures", "strong")],
-            parts=[Lines(lines=[f"{k} x {reason}" for reason, k in reasons], indent=4)],
-        ),
-    ]
-
-
-def _row(r: Covered, unit: str) -> tuple[str, ...]:
-    low, high = (100 * x for x in r.coverage)
-    unknown = f" ({r.unknown} not seen)" if r.unknown else ""
-    return (
-        r.name, sized(r.truth, unit), quantity(r.truth + r.bias, r.bias_sd, unit).text, f"{r.bias / r.said:+.2f}",
-        f"{r.ratio[0]:.2f} to {r.ratio[1]:.2f}", f"{r.inside} of {r.runs}{unknown}", f"{low:.1f} to {high:.1f} %",
-        f"{r.largest_z:.2g}",
-    )  # fmt: skip
-
-
-def coverage_figure(coverage: Coverage, title: str, width: float) -> Figure:
-    """Draw how often intervals hold the truth, and the errors in standard deviations."""
-    rows = coverage.rows
-    if not rows:
-        return stacked(title, [said_panel("no run gave a number")], width)
-
-    def shares(axes: Axes) -> None:
-        at = np.arange(len(rows))
-        low, high = (100 * np.array([r.coverage[k] for r in rows]) for k in (0, 1))
-        middle = np.array([100 * r.inside / r.runs for r in rows])
-        axes.errorbar(middle, at, xerr=(np.maximum(middle - low, 0), np.maximum(high - middle, 0)), fmt="o",
-                      color=PREDICTED, label="share, 95 %")  # fmt: skip
-        axes.axvline(95.0, color=BOUND, linewidth=1.0, label="said")
-        axes.set_yticks(at, [r.name for r in rows])
-        axes.set_ylim(len(rows) - 0.5, -0.5)
-        axes.set_xlabel("95 % intervals that hold the truth [%]")
-
-    def errors(axes: Axes) -> None:
-        from scipy.stats import norm
-
-        z = np.concatenate([coverage.z(r.name) for r in rows])
-        reach = max(4.0, float(np.ceil(np.max(np.abs(z)))))
-        axes.hist(z, bins=np.linspace(-reach, reach, 41).tolist(), density=True, color=BAND, label="all parameters")
-        x = np.linspace(-reach, reach, 200)
-        axes.plot(x, norm.pdf(x), color=MEASURED, label="standard normal")
-        axes.set_xlabel("error / standard deviation")
-        head(axes, f"rms {np.sqrt(np.mean(z**2)):.2f}, largest {np.max(np.abs(z)):.2g}")
-
-    tall = max(2.5, 0.22 * len(rows))
-    block = Block(columns=[[panel(shares, height=tall)], [panel(errors, height=tall)]], shared=False)
-    return stacked(title, [block], width)

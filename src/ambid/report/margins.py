@@ -201,7 +201,7 @@ def sensitivity_panel(axes: Axes, margins: Margins, axis: str) -> None:
     axes.set_ylabel("sensitivity [dB]")
     zone = s.rating
     good, hz = zone.worst in LONG_TERM, s.measured_frequency_hz if zone.source == "measured" else s.frequency_hz
-    head(axes, f"axis {axis}: {zone.source} {zone.peak_db:.2f} dB at {hz:.3g} Hz, zone {zone.words}", good=good)
+    head(axes, f"axis {axis}: {zone.source} {zone.value:.2f} dB at {hz:.3g} Hz, zone {zone.words}", good=good)
 
 
 def _compliance(axes: Axes, margins: Margins, axis: str) -> None:

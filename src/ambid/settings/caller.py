@@ -35,11 +35,10 @@ _BY_WORD = ("column", "layout", "limits", "spread")  # settings that hold values
 _COMMANDS = {
     "identify_nonlinear": ("identify", "identify_nonlinear"), "alarms": ("history", "alarms"),
     "design_experiment": ("design experiment",), "design_controller": ("design controller",),
-    "fleet_run": ("fleet run",), "fleet_simulate": ("fleet simulate",),
+    "fleet_run": ("fleet run",),
 }  # fmt: skip
 _CALLS = {
-    "alarms": "ambid.ledger.watch", "fleet_run": "ambid.fleet.run.run_fleet",
-    "fleet_simulate": "ambid.fleet.trials.monte_carlo", "recover": "",
+    "alarms": "ambid.ledger.watch", "fleet_run": "ambid.fleet.run.run_fleet", "recover": "",
 }  # fmt: skip
 
 

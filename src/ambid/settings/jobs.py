@@ -130,7 +130,7 @@ _JOBS = (
     ),
     declare(
         "history",
-        "ledger bearing every rename redate remove record undo alarms acknowledge until who why export publish json "
+        "ledger bearing every rename redate remove record undo alarms acknowledge until who why publish json "
         "plot report strict",
         record={
             "kind": "text",
@@ -145,11 +145,6 @@ _JOBS = (
             "shown": "",
             "metavar": "BEARING",
             "argument": True,
-        },
-        export={
-            "long": "tables",
-            "help": "Write the ledger's tables as Parquet, for DuckDB or pandas.",
-            "metavar": "FOLDER",
         },
     ),
     declare("ledger check", "ledger", ledger=_LEDGER),
@@ -238,19 +233,6 @@ _JOBS = (
             "of the file.",
             "shown": "",
         },
-    ),
-    declare(
-        "fleet simulate",
-        "rig runs seed duration amplitude nonlinear job set workers limit_s json plot report strict",
-        rig={
-            "help": "Rig file, or preset by its name; each parameter has a value: that is the truth.",
-            "kind": "text",
-            "argument": True,
-            "required": True,
-        },
-        seed={"help": "Seed of the first; the others follow.", "default": 1},
-        amplitude={"help": "Peak of the excitation.", "shown": "as ambid simulate"},
-        nonlinear={"help": "Simulate the nonlinear magnet."},
     ),
     declare(
         "recover",

@@ -352,7 +352,6 @@ SETTINGS = (
         required=True,
     ),
     Setting("rig", "path", "RIG", "Rig file (TOML): what is known about the bench."),
-    Setting("runs", "whole", "N", "Number of records.", least=1, default=100),
     Setting(
         "run_up",
         "text",
