@@ -34,11 +34,11 @@ WHAT = ("rename", "redate", "remove", "merge", "restore", "retain", "backup", "m
 def do(what: str, ledger: Ledger, other: str, archive: str) -> None:
     match what:
         case "rename":
-            ledger.rename("A", "B")
+            ledger.correct("rename", "A", "B")
         case "redate":
-            ledger.redate("A", 5.0, record="day7.h5")
+            ledger.correct("redate", "A", 5.0, record="day7.h5")
         case "remove":
-            ledger.remove("A")
+            ledger.correct("remove", "A")
         case "merge":
             ledger.merge(other)
         case "restore":

@@ -22,8 +22,8 @@ def fill(place):
         notes = (Note(at=BEGIN + 5.0, kind="change", text="it fell", parameter="k_i"),)
         ledger.add([entry(k, name, document=f'{{"a": {k}}}', events=notes) for k in range(4) for name in ("A", "B")])
         ledger.fail([Failure(**LACK, sha="f")])
-        ledger.rename("B", "pump 1", who="anna", why="misspelt")
-        ledger.remove("A", record="day0.h5")
+        ledger.correct("rename", "B", "pump 1", who="anna", why="misspelt")
+        ledger.correct("remove", "A", record="day0.h5")
         with ledger._engine.begin() as c:
             c.execute(
                 text(f"INSERT INTO silence VALUES (1, 5, 'silenced', 'A', 'k_i -5 %', 'k_i', {BEGIN}, NULL, 'x', 'y')")
@@ -37,7 +37,7 @@ def test_a_backup_holds_all_and_is_restored(place, tmp_path):
         assert ledger.backup(backup) == 8
         assert contents(backup) == before
         assert [p.name for p in tmp_path.glob("backup*")] == ["backup.db"]
-        ledger.remove("pump 1")
+        ledger.correct("remove", "pump 1")
         ledger.add([entry(9, "C")])
         done = ledger.restore(backup, who="anna")
         after = contents(place)
@@ -51,7 +51,7 @@ def test_two_ledgers_become_one_and_what_both_have_stays(place, tmp_path):
     fill(place)
     with open_ledger(tmp_path / "other.db") as other:
         other.add([entry(k, "B") for k in range(2, 7)] + [entry(0, "A"), entry(0, "E", document="{}")])
-        other.rename("E", "pump 5")
+        other.correct("rename", "E", "pump 5")
         other.fail([Failure(**LACK, sha="g")])
     with open_ledger(place) as ledger:
         done = ledger.merge(tmp_path / "other.db")

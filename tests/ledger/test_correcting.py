@@ -44,8 +44,8 @@ def contents(ledger):
 
 def test_a_bearing_gets_its_right_name_and_the_records_right_time(ledger):
     before = contents(ledger)
-    renamed = ledger.rename("pmup 1", " pump  1", who="anna", why="misspelt")
-    redated = ledger.redate("pump 1", BEGIN + 2 * DAY, record="day2.h5")
+    renamed = ledger.correct("rename", "pmup 1", " pump  1", who="anna", why="misspelt")
+    redated = ledger.correct("redate", "pump 1", BEGIN + 2 * DAY, record="day2.h5")
     assert [b.name for b in ledger.bearings()] == ["pump 1"]
     h = ledger.history("pump 1")
     assert [e.taken_at for e in h.estimates] == [BEGIN + k * DAY for k in (0, 1, 2, 9)]
@@ -66,14 +66,14 @@ def test_a_bearing_gets_its_right_name_and_the_records_right_time(ledger):
 
 
 def test_one_record_goes_to_the_bearing_whose_it_is(ledger):
-    ledger.rename("pmup 1", "pump 2", record="day1.h5")
+    ledger.correct("rename", "pmup 1", "pump 2", record="day1.h5")
     assert [(b.name, b.estimates) for b in ledger.bearings()] == [("pmup 1", 2), ("pump 1", 1), ("pump 2", 1)]
     assert [f.bearing for f in ledger.failures().values()] == ["pmup 1"]
 
 
 def test_what_was_removed_is_seen_nowhere_and_comes_back(ledger):
     before = contents(ledger)
-    gone = ledger.remove("pmup 1", why="another machine")
+    gone = ledger.correct("remove", "pmup 1", why="another machine")
     assert [b.name for b in ledger.bearings()] == ["pump 1"]
     for name in ("pmup 1", REMOVED):
         with pytest.raises(AmbidError, match="has no bearing"):
@@ -87,10 +87,10 @@ def test_what_was_removed_is_seen_nowhere_and_comes_back(ledger):
 
 
 def test_a_correction_holds_for_later_estimates_of_its_records(ledger):
-    ledger.rename("pmup 1", "pump 1")
-    ledger.redate("pump 1", BEGIN + 2 * DAY, record="day2.h5")
-    ledger.rename("pump 1", "pump one")
-    ledger.remove("pump one", record="day0.h5")
+    ledger.correct("rename", "pmup 1", "pump 1")
+    ledger.correct("redate", "pump 1", BEGIN + 2 * DAY, record="day2.h5")
+    ledger.correct("rename", "pump 1", "pump one")
+    ledger.correct("remove", "pump one", record="day0.h5")
     newer = [entry(k, "pmup 1", version="9.0.0") for k in range(2)] + [entry(7, "pmup 1")]
     note = Note(at=LATE + 5.0, kind="change", text="it fell")
     newer.append(entry(2, "pmup 1", version="9.0.0", taken_at=LATE, events=(note,)))
@@ -104,17 +104,17 @@ def test_a_correction_holds_for_later_estimates_of_its_records(ledger):
 
 
 def test_an_undo_takes_back_what_that_correction_changed_and_nothing_else(ledger):
-    ledger.rename("pmup 1", "P")
-    ledger.redate("P", BEGIN + 2 * DAY, record="day2.h5")
+    ledger.correct("rename", "pmup 1", "P")
+    ledger.correct("redate", "P", BEGIN + 2 * DAY, record="day2.h5")
     ledger.undo(1)
     assert [e.taken_at for e in ledger.history("pmup 1").estimates] == [BEGIN, BEGIN + DAY, BEGIN + 2 * DAY]
-    ledger.rename("pmup 1", "P")
+    ledger.correct("rename", "pmup 1", "P")
     ledger.undo(2)
     assert [e.taken_at for e in ledger.history("P").estimates] == [BEGIN, BEGIN + DAY, LATE]
 
 
 def test_an_undo_brings_back_what_came_to_the_removed_since(ledger):
-    ledger.remove("pmup 1", record="day0.h5")
+    ledger.correct("remove", "pmup 1", record="day0.h5")
     ledger.add([entry(0, "pmup 1", version="9.0.0")])
     ledger.undo(1)
     assert ledger.history("pmup 1").estimates[0].version == "9.0.0"
@@ -123,7 +123,7 @@ def test_an_undo_brings_back_what_came_to_the_removed_since(ledger):
 
 def test_there_and_back_leaves_names_as_they_are(ledger):
     for names in (("pmup 1", "B"), ("B", "pmup 1"), ("pmup 1", "B"), ("B", "C")):
-        ledger.rename(*names)
+        ledger.correct("rename", *names)
     ledger.add([entry(0, name, sha="pmup 10", version="9.0.0", rig=name) for name in ("pmup 1", "B", "C", "D")])
     names = {b.name: b.estimates for b in ledger.bearings()}
     assert names == {"C": 3, "D": 1, "pump 1": 1}
@@ -131,7 +131,7 @@ def test_there_and_back_leaves_names_as_they_are(ledger):
 
 def test_a_record_that_stands_there_already_is_told(ledger):
     ledger.add([entry(1, "pump 1", sha="pmup 11", version="0.0.9")])
-    done = ledger.rename("pmup 1", "pump 1")
+    done = ledger.correct("rename", "pmup 1", "pump 1")
     assert "1 record stood there already, such as day1.h5 of 2026-01-02 00:00" in done.text
     assert [e.version for e in ledger.history("pump 1").estimates if e.record == "day1.h5"] == ["0.1.0"]
 
@@ -139,12 +139,15 @@ def test_a_record_that_stands_there_already_is_told(ledger):
 @pytest.mark.parametrize(
     ("do", "why"),
     [
-        (lambda x: x.rename("pump 3", "pump 1"), r"has no bearing 'pump 3'\. Did you mean 'pump 1'\?"),
-        (lambda x: x.rename("pump 1", "  "), "a bearing must have a name"),
-        (lambda x: x.rename("pump 1", "pump  1"), "has that name already"),
-        (lambda x: x.redate("pmup 1", BEGIN), "'pmup 1' has 3 records, and a time is that of one"),
-        (lambda x: x.redate("pump 1", BEGIN + 9 * DAY), "has that time already"),
-        (lambda x: x.remove("pmup 1", record="day3.h5"), "has no such record; it has day0.h5, day1.h5, day2.h5"),
+        (lambda x: x.correct("rename", "pump 3", "pump 1"), r"has no bearing 'pump 3'\. Did you mean 'pump 1'\?"),
+        (lambda x: x.correct("rename", "pump 1", "  "), "a bearing must have a name"),
+        (lambda x: x.correct("rename", "pump 1", "pump  1"), "has that name already"),
+        (lambda x: x.correct("redate", "pmup 1", BEGIN), "'pmup 1' has 3 records, and a time is that of one"),
+        (lambda x: x.correct("redate", "pump 1", BEGIN + 9 * DAY), "has that time already"),
+        (
+            lambda x: x.correct("remove", "pmup 1", record="day3.h5"),
+            "has no such record; it has day0.h5, day1.h5, day2.h5",
+        ),
         (lambda x: x.undo(7), "has no such correction; it has none"),
     ],
 )
@@ -159,8 +162,8 @@ def test_records_of_one_name_are_told_apart_by_their_digits(tmp_path):
     with open_ledger(tmp_path / "l.db") as ledger:
         ledger.add([entry(k, record="x/day.h5", sha=f"{k}abcdef0123") for k in range(2)])
         with pytest.raises(AmbidError, match="2 records of 'A' have that name: 0abcdef0123 of 2026-01-01"):
-            ledger.remove("A", record="day.h5")
-        assert ledger.remove("A", record="1abcde").text == "1 estimate of 1 record of 'A' removed"
+            ledger.correct("remove", "A", record="day.h5")
+        assert ledger.correct("remove", "A", record="1abcde").text == "1 estimate of 1 record of 'A' removed"
 
 
 KILLED = """
@@ -173,10 +176,10 @@ with open_ledger(sys.argv[1]) as ledger:
 """
 
 
-@pytest.mark.parametrize("do", ["ledger.remove('pmup 1')", "ledger.restore(sys.argv[2])"])
+@pytest.mark.parametrize("do", ["ledger.correct('remove', 'pmup 1')", "ledger.restore(sys.argv[2])"])
 def test_one_killed_in_the_middle_leaves_all_as_before(ledger, place, tmp_path, do):
     ledger.backup(tmp_path / "b.db")
-    ledger.rename("pump 1", "pump 2")
+    ledger.correct("rename", "pump 1", "pump 2")
     before = contents(ledger)
     run = subprocess.Popen(
         [sys.executable, "-c", KILLED.format(do), place, str(tmp_path / "b.db")], stdin=subprocess.PIPE,
@@ -187,4 +190,4 @@ def test_one_killed_in_the_middle_leaves_all_as_before(ledger, place, tmp_path, 
     run.send_signal(signal.SIGKILL)
     run.communicate()
     assert (contents(ledger), len(ledger.corrections()), ledger.check()) == (before, 1, ())
-    ledger.remove("pmup 1")
+    ledger.correct("remove", "pmup 1")

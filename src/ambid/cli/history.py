@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -32,7 +33,7 @@ def _corrected(v: Values) -> bool:
         return False
     if len(changes) > 1:
         raise AmbidError(f"{' and '.join(map(setting, changes))} are {len(changes)} changes. Make them one by one")
-    change = changes[0]
+    change: Any = changes[0]
     shown = "every alarms acknowledge until publish json plot report strict"
     refuse_given(v.only(shown), f"{{}} is not for {setting(change)}")
     if change == "undo":
@@ -43,12 +44,9 @@ def _corrected(v: Values) -> bool:
     with open_ledger(v.ledger, make=False) as ledger:
         if change == "undo":
             done = ledger.undo(v.undo, **about)
-        elif change == "rename":
-            done = ledger.rename(v.bearing, v.rename, record=v.record, **about)
-        elif change == "redate":
-            done = ledger.redate(v.bearing, moment(v.redate, "redate"), record=v.record, **about)
         else:
-            done = ledger.remove(v.bearing, record=v.record, **about)
+            to = {"rename": v.rename, "redate": moment(v.redate, "redate") if v.redate else ""}.get(change, "")
+            done = ledger.correct(change, v.bearing, to, record=v.record, **about)
         typer.echo(f"{ledger.shown}: {done.text}. Undo: {command_of('history', ledger=ledger.shown, undo=done.number)}")
     return True
 

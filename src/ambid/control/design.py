@@ -161,14 +161,7 @@ def noise_of(noise: Noise | None, sensor_sd: Mapping[str, float]) -> tuple[float
     """Return the noise of position and current, m and A rms, with what is assumed of it: the rig's, else the estimated
     `sensor_sd`.
     """
-    noise_given = noise or Noise()
-    values = [
-        math.hypot(white, step / math.sqrt(12.0))
-        for white, step in (
-            (noise_given.position, noise_given.position_resolution),
-            (noise_given.current, noise_given.current_resolution),
-        )
-    ]
+    values = [(noise or Noise()).sensor_rms(kind) for kind in ("position", "current")]
     if any(values):
         return values[0], values[1], "the noise of the sensors is the rig's [noise]"
     sds = [[x for name, x in sensor_sd.items() if name.endswith(kind)] for kind in ("position", "current")]

@@ -26,12 +26,12 @@ from ambid.physics.linear_model import discretise
 from ambid.physics.loop import Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.unknowns import split_rows
+from ambid.simulation.rotor_bench import kind_of
 
 _ROUNDS = 2000  # of the multiplicative algorithm
 _MOST_TERMS = 2e9  # that it adds up, of many lines and parameters in fewer rounds
 _SETTLED = 1e-3  # of the equivalence theorem: largest slope over the mean
 _SHARP = 8.0  # power mean by which the worst of several is taken
-_QUANTISED = 12.0**-0.5  # sd of a step's rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,7 +45,7 @@ class Innovation:
     def of(cls, plant: Plant, noise: Noise) -> Innovation:
         """Return that of a bench's noise; EstimationError where an output has none, and could be known exactly."""
         plant_model, force, voltage = plant.model, *noise.held_rms(plant.rate_hz)
-        sensors = np.array([_sensor_sd(noise, role) for role in plant_model.outputs])
+        sensors = np.array([noise.sensor_rms(kind_of(role)) for role in plant_model.outputs])
         if not np.all(sensors > 0.0):
             silent = plant_model.outputs[int(np.argmin(sensors))]
             raise EstimationError(
@@ -72,12 +72,6 @@ class Innovation:
         right = np.broadcast_to(self.gain.astype(complex), (omega.size, *self.gain.shape))
         inverse = np.eye(d.C.shape[0]) - d.C @ np.linalg.solve(inner, right)
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)) @ inverse)
-
-
-def _sensor_sd(noise: Noise, role: str) -> float:
-    """Return the noise of an output's sensor with that of its resolution."""
-    kind = role.split("_")[-1].rstrip("0123456789")
-    return float(np.hypot(getattr(noise, kind), _QUANTISED * getattr(noise, f"{kind}_resolution")))
 
 
 def reported(name: str) -> bool:

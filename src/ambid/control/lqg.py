@@ -83,11 +83,8 @@ class SampledPlant:
     def sensors(self, noise: Noise) -> Array:
         """Return the standard deviations of the outputs, with those of rounding."""
         sd = np.zeros(self.C.shape[0])
-        for rows, white, step in zip(
-            self.kinds, (noise.position, noise.current), (noise.position_resolution, noise.current_resolution),
-            strict=True,
-        ):  # fmt: skip
-            sd[rows] = math.hypot(white, step / math.sqrt(12.0))
+        for rows, kind in zip(self.kinds, ("position", "current"), strict=True):
+            sd[rows] = noise.sensor_rms(kind)
         return sd
 
 

@@ -20,6 +20,7 @@ from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import Between, PeriodSpectra, find_excitation, period_spectra, references_of
 from ambid.simulation.plant import closed_loop_poles, fed_back
+from ambid.simulation.rotor_bench import kind_of
 
 _NO_FEEDBACK = 1e-4  # share of an input below which nothing is fed back
 _IMPLIED = 0.03  # part of its largest line below which an excitation that follows from [loop] is rounding
@@ -85,7 +86,7 @@ def plant_of(estimate: Numbers, rate_hz: float, speed: float = 0.0) -> Plant:
             )
     else:
         of, theta = model(estimate.model), estimate.values
-    if "position" not in {role.split("_")[-1].rstrip("0123456789") for role in of.outputs}:
+    if "position" not in {kind_of(role) for role in of.outputs}:
         raise EstimationError(
             f"model {of.name!r} has no position: there is no position loop, and no margin of it. Use model 'one-axis'"
         )

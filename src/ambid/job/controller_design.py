@@ -42,12 +42,12 @@ from ambid.control.gain_sets import FORMS
 from ambid.control.verification import Trials, checks_of_verifications, verify_all
 from ambid.control.zones import zone_of
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.estimate import Check, Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, part_of, silent
 from ambid.job.closed_loop import Numbers, plant_of
 from ambid.job.data import Clock, RigSource, rig_entry
-from ambid.job.loop_margins import given, noise_by_name
+from ambid.job.loop_margins import given, noise_by_name, of_plant
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Interval, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
@@ -362,9 +362,7 @@ def _result(
         for name, (x, _), a in zip(("before", "after"), loops, (0.0, 0.5), strict=True)
     }
     checks = {**checks_of(goals, was, now, worst, len(seen)), **checks_of_verifications(trials["after"])}
-    if not of.known.passed:
-        reasons = "; ".join(f"{r.check}: {r.text}" for r in of.known.verdict.reasons)
-        checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    checks = of_plant(of.known) | checks
     agrees = magnet_check(laws_of(of.plant, of.rig, of.point or of.rig.operating_point)[0], of.plant.theta, of.sd)
     checks |= {} if agrees is None else {"magnet_agrees": agrees}
     turns = of.speeds is not None and of.speeds[1] > of.speeds[0]

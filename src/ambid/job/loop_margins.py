@@ -47,6 +47,7 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.synchronous import Separated, separate
 from ambid.settings.caller import saved, setting
 from ambid.settings.calls import of_job
+from ambid.simulation.rotor_bench import kind_of
 
 
 @of_job("margins")
@@ -207,9 +208,7 @@ def margins_and_loop(
     largest, hz = float(20.0 * np.log10(loop.singular[top])), float(loop.frequency_hz[top])
     band = None if spectra is None else (float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1]))
     checks = checks_of(loop, found, measured, band)
-    if not estimate.passed:
-        reasons = "; ".join(f"{r.check}: {r.text}" for r in estimate.verdict.reasons)
-        checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    checks = of_plant(estimate) | checks
     noise, whose = noise_by_name(estimate, rig, loop.plant)
     room = _room(estimate, rig, loop)
     machine = _machine(estimate, rig)
@@ -227,6 +226,12 @@ def margins_and_loop(
     return result, loop
 
 
+def of_plant(estimate: Numbers) -> dict[str, Check]:
+    """Return the check that an estimate does not pass, for what rests on its plant; nothing where it does."""
+    reasons = "; ".join(f"{r.check}: {r.text}" for r in estimate.verdict.reasons)
+    return {} if estimate.passed else {"estimate": Check(passed=False, detail=f"of the plant: {reasons}")}
+
+
 def noise_by_name(
     estimate: Numbers, rig: Rig, plant: Plant
 ) -> tuple[Mapping[str, float] | None, Literal["rig", "estimate"] | None]:
@@ -234,12 +239,9 @@ def noise_by_name(
     of = plant.model
     if rig.noise is not None:
         force, voltage = rig.noise.held_rms(plant.rate_hz)
-        by_kind = {"force": force, "voltage": voltage}
-        for kind in ("position", "current"):
-            step = getattr(rig.noise, f"{kind}_resolution")
-            by_kind[kind] = math.hypot(getattr(rig.noise, kind), step / math.sqrt(12.0))
-        names = (*of.disturbances, *of.outputs)
-        return {n: by_kind[n.split("_")[-1].rstrip("0123456789")] for n in names}, "rig"
+        by_kind = {kind: rig.noise.sensor_rms(kind) for kind in ("position", "current")}
+        by_kind |= {"force": force, "voltage": voltage}
+        return {n: by_kind[kind_of(n)] for n in (*of.disturbances, *of.outputs)}, "rig"
     if isinstance(estimate, RotorEstimate):
         return estimate.noise, "estimate"
     if estimate.noise.disturbance_sd or estimate.noise.sensor_sd:

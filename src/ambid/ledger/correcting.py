@@ -12,7 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.errors import AmbidError, counted, listed, nearest
 from ambid.ledger.entry import ARCHIVED, OWN, REMOVED, Correction, day, tables
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _LEAST = 6  # digits of a SHA-256 that name a record
 _SHOWN = 4  # records in a refusal
 Place = tuple[str, float]  # bearing, and time of the record
+Kind = Literal["rename", "redate", "remove"]
 Before = tuple[str | None, float | None]  # those of them that a correction changed
 
 
@@ -42,28 +43,37 @@ class Stored:
     added_at: float
 
 
-def rename(c: Connection, ledger: str, bearing: str, new: str, record: str | None, **about: str) -> Correction:
-    """Give a bearing, or one record of it, another name."""
-    name = " ".join(new.split())
+def corrected(
+    c: Connection, ledger: str, kind: Kind, bearing: str, to: str | float, record: str | None, **about: str
+) -> Correction:
+    """Give a bearing, or one record of it, another name or time, or take it out of what is shown and judged."""
+    name = " ".join(str(to).split()) if kind == "rename" else REMOVED if kind == "remove" else bearing
     if not name:
-        raise AmbidError(f"{setting('rename', repr(new))}: a bearing must have a name. Give one")
-    if name == bearing:
-        raise AmbidError(f"{setting('rename', repr(new))}: the bearing has that name already. Give another")
+        raise AmbidError(f"{setting('rename', repr(to))}: a bearing must have a name. Give one")
+    if kind == "rename" and name == bearing:
+        raise AmbidError(f"{setting('rename', repr(to))}: the bearing has that name already. Give another")
     own = estimates_of(c, ledger, bearing, record)
-    there = {e.sha for e in stored(c, name)}
+    text = f"{_counted(own)} of {bearing!r} removed"
+    if kind == "rename":
+        text = f"{bearing!r} became {name!r} ({_counted(own)}){_twice(own, stored(c, name))}"
+    elif kind == "redate":
+        text = _redated(own, bearing, float(to))
+    moves = {e.key: (name, float(to) if kind == "redate" else e.taken_at) for e in own}
+    return correct(c, own, moves, kind, bearing if kind == "remove" else name, text, **about)
+
+
+def _twice(own: Sequence[Stored], others: Sequence[Stored]) -> str:
+    """Say which records of a bearing stand under its new name too."""
+    there = {e.sha for e in others}
     twice = {e.sha: e for e in own if e.sha in there}
-    text = f"{bearing!r} became {name!r} ({_counted(own)})"
-    if twice:
-        first = next(iter(twice.values()))
-        text += (
-            f"; {counted(len(twice), 'record')} stood there already, such as {first.record} of {day(first.taken_at)}"
-        )
-    return correct(c, own, {e.key: (name, e.taken_at) for e in own}, "rename", name, text, **about)
+    if not twice:
+        return ""
+    first = next(iter(twice.values()))
+    return f"; {counted(len(twice), 'record')} stood there already, such as {first.record} of {day(first.taken_at)}"
 
 
-def redate(c: Connection, ledger: str, bearing: str, taken_at: float, record: str | None, **about: str) -> Correction:
-    """Say when a record was taken; all estimates from it go there."""
-    own = estimates_of(c, ledger, bearing, record)
+def _redated(own: Sequence[Stored], bearing: str, taken_at: float) -> str:
+    """Say what another time of a record changes; refuse several records, and the same time."""
     if len({e.sha for e in own}) > 1:
         raise AmbidError(
             f"{bearing!r} has {counted(len({e.sha for e in own}), 'record')}, and a time is that of one. Give "
@@ -71,15 +81,7 @@ def redate(c: Connection, ledger: str, bearing: str, taken_at: float, record: st
         )
     if all(e.taken_at == taken_at for e in own):
         raise AmbidError(f"the record of {bearing!r} has that time already. Give another")
-    text = f"{own[0].record} of {day(own[0].taken_at)} was taken {day(taken_at)} ({_counted(own)})"
-    return correct(c, own, {e.key: (bearing, taken_at) for e in own}, "redate", bearing, text, **about)
-
-
-def remove(c: Connection, ledger: str, bearing: str, record: str | None, **about: str) -> Correction:
-    """Take a bearing, or one record of it, out of what is shown and judged."""
-    own = estimates_of(c, ledger, bearing, record)
-    text = f"{_counted(own)} of {bearing!r} removed"
-    return correct(c, own, {e.key: (REMOVED, e.taken_at) for e in own}, "remove", bearing, text, **about)
+    return f"{own[0].record} of {day(own[0].taken_at)} was taken {day(taken_at)} ({_counted(own)})"
 
 
 def undo(c: Connection, ledger: str, number: int, **about: str) -> Correction:

@@ -20,7 +20,7 @@ from ambid.errors import AmbidError, counted, needs
 from ambid.estimation.result import Reason, Result
 from ambid.ledger import checking, copying, correcting, entry
 from ambid.ledger.copying import Keep
-from ambid.ledger.correcting import Stored
+from ambid.ledger.correcting import Kind, Stored
 from ambid.ledger.entry import Correction, Entry, key_of
 from ambid.ledger.opening import (
     OlderLedgerError,
@@ -260,43 +260,21 @@ class Ledger:
         with self._reading() as c:
             return history_of(c, bearing, self.shown, every=every)
 
-    def rename(self, bearing: str, new: str, *, record: str | None = None, who: str = "", why: str = "") -> Correction:
-        """Give a bearing another name; where there is one of that name, it gets the estimates too.
-
-        Later estimates of the same records go there as well. `undo` takes it back.
+    def correct(
+        self, kind: Kind, bearing: str, to: str | float = "", *, record: str | None = None, who: str = "", why: str = ""
+    ) -> Correction:
+        """Correct a bearing, or one record of it; later estimates of the same records follow. `undo` takes it back.
 
         Parameters
         ----------
-        bearing, new : str
+        kind : {"rename", "redate", "remove"}
+            Another name: where there is a bearing of it, that gets the estimates too. When the record was taken: all
+            estimates of it go there. Out of all histories.
+        bearing : str
+        to : str or float, optional
+            The name; or the time, s since 1970, UTC.
         record : str, optional
             Only this record: name of its file, or digits of its SHA-256.
-        who, why : str, optional
-            Who corrects, default the account, and for what reason.
-
-        Returns
-        -------
-        Correction
-
-        Raises
-        ------
-        AmbidError
-            If there is no such bearing or record.
-        """
-        with self._writing(alone=True) as c:
-            return correcting.rename(c, self.shown, bearing, new, record, who=who, why=why)
-
-    def redate(
-        self, bearing: str, taken_at: float, *, record: str | None = None, who: str = "", why: str = ""
-    ) -> Correction:
-        """Say when a record was taken; all estimates of it go there, later ones as well. `undo` takes it back.
-
-        Parameters
-        ----------
-        bearing : str
-        taken_at : float
-            S since 1970, UTC.
-        record : str, optional
-            Name of its file, or digits of its SHA-256; default the only one of the bearing.
         who, why : str, optional
             Who corrects, default the account, and for what reason.
 
@@ -310,30 +288,7 @@ class Ledger:
             If there is no such bearing or record, or it is not clear which.
         """
         with self._writing(alone=True) as c:
-            return correcting.redate(c, self.shown, bearing, taken_at, record, who=who, why=why)
-
-    def remove(self, bearing: str, *, record: str | None = None, who: str = "", why: str = "") -> Correction:
-        """Take a bearing, or one record, out of all histories; later estimates of it stay out. `undo` takes it back.
-
-        Parameters
-        ----------
-        bearing : str
-        record : str, optional
-            Only this record: name of its file, or digits of its SHA-256.
-        who, why : str, optional
-            Who corrects, default the account, and for what reason.
-
-        Returns
-        -------
-        Correction
-
-        Raises
-        ------
-        AmbidError
-            If there is no such bearing or record.
-        """
-        with self._writing(alone=True) as c:
-            return correcting.remove(c, self.shown, bearing, record, who=who, why=why)
+            return correcting.corrected(c, self.shown, kind, bearing, to, record, who=who, why=why)
 
     def undo(self, number: int, *, who: str = "", why: str = "") -> Correction:
         """Put estimates where they were before a correction; that is one too, and can be undone.

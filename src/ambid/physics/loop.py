@@ -194,6 +194,10 @@ class Noise:
         root = math.sqrt(rate_hz / 2.0)
         return self.force * root, self.voltage * root
 
+    def sensor_rms(self, kind: str) -> float:
+        """Return the rms of a sensor's noise, "position" in m or "current" in A, with that of rounding to its steps."""
+        return math.hypot(getattr(self, kind), getattr(self, f"{kind}_resolution") / math.sqrt(12.0))
+
 
 def placed_loop(
     parameters: Mapping[str, float],
