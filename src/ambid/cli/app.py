@@ -58,6 +58,7 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "export": "'ambid export ESTIMATE.json -o FILE', of what --json ESTIMATE.json wrote",
     },
     "console": {"key": "--certificate CERT,KEY"}, "export": {"to": "--library"},
+    "init": {"plot": "'ambid info RECORD --plot FILE.png'"},
     "history": {"export": "", "tables": "", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
     "design controller": {"method": "--kind", "export": "--law", "judges": ""}, "design experiment": {"lines": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},

@@ -32,11 +32,9 @@ def command(v: Values) -> None:
         raise AmbidError("--rate, --gaps and --layout are for reading a record; --preset reads none. Omit them")
     if v.preset is not None and (v.column or v.coil):
         raise AmbidError("--column and --coil are for a record; --preset reads none. Omit them")
-    if v.preset is not None and v.plot is not None:
-        raise AmbidError("--plot draws the columns of a record; --preset reads none. Omit it")
-    with Outputs(v.record, plot=v.plot) as outputs:
+    with Outputs(v.record) as outputs:
         outputs.claim(v.out, "out", force=v.force)
-        text = _of_preset(v.preset) if v.preset is not None else _of_record(v, outputs)
+        text = _of_preset(v.preset) if v.preset is not None else _of_record(v)
         if v.out is not None:
             outputs.stage_text(v.out, text)
     if v.out is None:
@@ -58,7 +56,7 @@ def command(v: Values) -> None:
         )
 
 
-def _of_record(v: Values, outputs: Outputs) -> str:
+def _of_record(v: Values) -> str:
     from ambid.job.drafting import draft
 
     ask = None if v.yes or not _on_terminal() else _chosen
@@ -73,10 +71,6 @@ def _of_record(v: Values, outputs: Outputs) -> str:
         typer.echo(f"{role}: {found[0].channel.name}, because {found[0].why}", err=True)
     for note in made.guess.notes:
         typer.echo(note, err=True)
-    if v.plot is not None:
-        from ambid.report.record import roles_figure  # much is loaded for it
-
-        outputs.draw(v.plot, lambda: roles_figure(made.record, ranked), lambda _: None)
     return made.text
 
 

@@ -243,10 +243,9 @@ _JOBS = (
     ),
     declare(
         "init",
-        "record out column coil preset plot yes rate_hz gaps layout force",
+        "record out column coil preset yes rate_hz gaps layout force",
         record={"required": False},
         out={"help": "Rig file to write.", "shown": "standard output", "required": False, "metavar": "RIG"},
-        plot={"help": "Draw the columns that may be a role: signals, coherences, scores."},
         yes={"help": "Choose the most likely columns without asking.", "short": ""},
         force={"help": "Overwrite an existing rig file."},
     ),
