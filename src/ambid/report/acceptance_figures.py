@@ -11,8 +11,8 @@ import numpy as np
 
 from ambid.arrays import Complex
 from ambid.control.acceptance import Acceptance, Part, Run
-from ambid.report.drawing import BOUND, GREEN, MEASURED, ORANGE, PREDICTED, Block, head, log_axis, panel
-from ambid.report.margins import sensitivity_panel
+from ambid.report.drawing import BOUND, GREEN, MEASURED, ORANGE, PREDICTED, Block, head, panel
+from ambid.report.margins import sensitivity_panel, signed_panel
 from ambid.report.numbers import prefixed
 from ambid.report.rotor_drawing import balance_block, orbit_blocks, shapes_block
 from ambid.rotor.passage import changes_speed, positions_of, record_waterfall
@@ -92,24 +92,14 @@ def _stiffness(a: Acceptance) -> list[Block]:
 def _dynamic(axes: Axes, a: Acceptance, what: str) -> None:
     """Stiffness or damping of the bearings over frequency, of either sign."""
     assert a.stiffness is not None
-    f = a.stiffness.frequency_hz
-    if what == "stiffness":
-        curves, name, unit = dict(a.stiffness.real), "stiffness", "N/m"
-    else:
-        curves = {axis: x / (2.0 * np.pi * f) for axis, x in a.stiffness.imaginary.items()}
-        name, unit = "damping", "N s/m"
-    size = np.abs(np.concatenate(list(curves.values())))
-    scale, unit = prefixed(float(np.quantile(size, 0.3)), unit)
-    for axis, x in curves.items():
-        axes.plot(f, x / scale, label=axis)
-    axes.set_yscale("symlog", linthresh=float(np.quantile(size, 0.3)) / scale)
-    log_axis(axes.xaxis, float(f[0]), float(f[-1]))
+    f, curves, unit = a.stiffness.frequency_hz, dict(a.stiffness.real), "N/m"
+    if what == "damping":
+        curves, unit = {axis: x / (2.0 * np.pi * f) for axis, x in a.stiffness.imaginary.items()}, "N s/m"
+    signed_panel(axes, f, curves, what, unit)
     top = a.speeds[1] / (2.0 * np.pi)
     if f[0] < top < f[-1]:
         axes.axvline(top, color="#777777", linestyle=":", linewidth=0.9, label="maximum speed")
-    axes.set_xlabel("frequency [Hz]")
-    axes.set_ylabel(f"{name} [{unit}]")
-    head(axes, f"{name} of the bearings")
+    head(axes, f"{what} of the bearings")
 
 
 def _bodes(a: Acceptance) -> list[Block]:

@@ -162,7 +162,7 @@ def margins_figure(margins: Margins, title: str, width: float) -> Figure:
     blocks, curves = [block], margins.curves
     if curves.stiffness:
         dynamic = [
-            panel(_signed, curves.frequency_hz, values, name, unit, height=2.2)
+            panel(signed_panel, curves.frequency_hz, values, name, unit, height=2.2)
             for values, name, unit in (
                 (curves.stiffness, "dynamic stiffness", "N/m"), (curves.damping, "dynamic damping", "N s/m")
             )
@@ -216,10 +216,10 @@ def _compliance(axes: Axes, margins: Margins, axis: str) -> None:
     head(axes, f"least stiffness {sized(1.0 / compliance.largest, 'N/m')} at {compliance.frequency_hz:.3g} Hz")
 
 
-def _signed(axes: Axes, frequency_hz: Array, values: Mapping[str, Array], name: str, unit: str) -> None:
+def signed_panel(axes: Axes, frequency_hz: Array, values: Mapping[str, Array], name: str, unit: str) -> None:
     """Draw quantities of either sign by axis, in the logarithm beyond their smallest size over the frequencies."""
     size = np.abs(np.concatenate(list(values.values())))
-    least = float(np.quantile(size, 0.1))
+    least = float(np.quantile(size, 0.3))
     scale, unit = prefixed(least, unit)
     for axis, x in values.items():
         axes.plot(frequency_hz, x / scale, label=axis if len(values) > 1 else None)
