@@ -195,7 +195,17 @@ class Noise:
         return self.force * root, self.voltage * root
 
     def sensor_rms(self, kind: str) -> float:
-        """Return the rms of a sensor's noise, "position" in m or "current" in A, with that of rounding to its steps."""
+        """Return the rms of a sensor's noise with that of rounding to its steps.
+
+        Parameters
+        ----------
+        kind : {"position", "current"}
+
+        Returns
+        -------
+        float
+            m, or A.
+        """
         return math.hypot(getattr(self, kind), getattr(self, f"{kind}_resolution") / math.sqrt(12.0))
 
 
