@@ -153,26 +153,3 @@ def test_the_walk_score_is_the_slope_of_the_exact_likelihood(first):
     _, q_end, covariance_end = likelihood(J[ring], r[ring], at[ring], q, covariance, variance, noise)
     np.testing.assert_allclose(end, q_end, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(known, covariance_end, rtol=1e-8, atol=1e-10)
-
-
-def test_a_ramp_is_tested_as_in_the_dense_regression():
-    """Of all rows at once: numbers known before, a ramp along each cause, and white noise."""
-    rng = np.random.default_rng(10)
-    size, p, noise, last = 9, 4, 1.7, 2
-    J = rng.normal(size=(size, p, p))
-    left, q = rng.normal(size=(size, p)), rng.normal(size=(size, p))
-    covariance, walk = np.array([spd(rng, p) for _ in range(size)]), rng.uniform(size=p)
-    H, g = np.swapaxes(J, 1, 2) @ J, np.einsum("bij,bi->bj", J, left)
-    causes, lengths = np.array([[1.0, 0, 0, 0], [0, 0.5, 0, -2.0]]), np.array([3, 6])
-    T, ways = np.empty((2, 2, 2))
-    kernels.ramps(H, g, q, covariance, last, lengths, walk, causes, noise, T, ways)
-    for k, n in enumerate(lengths):
-        blocks = (last - n + 1 + np.arange(n)) % size
-        rho = np.concatenate([left[b] + J[b] @ q[blocks[0]] for b in blocks])
-        rows = np.concatenate([J[b] for b in blocks])
-        V = noise * np.eye(rho.size) + rows @ (covariance[blocks[0]] + n * np.diag(walk)) @ rows.T
-        for c, cause in enumerate(causes):
-            ramp = np.concatenate([(i + 0.5) / n * J[b] @ cause for i, b in enumerate(blocks)])
-            score, power = ramp @ np.linalg.solve(V, rho), ramp @ np.linalg.solve(V, ramp)
-            assert ways[k, c] == pytest.approx(-score / power, rel=1e-9)
-            assert T[k, c] == pytest.approx(score**2 / power, rel=1e-9)

@@ -185,9 +185,9 @@ def test_a_joint_cause_of_one_number_alone_moves_nothing_together(monkeypatch):
 JOINT = np.array([1.0, 1.0, 0.0])
 
 
-def looks(slope, *, seed=1, from_=200, count=400):
+def looks(slope, *, seed=1, from_=200, count=400, noise=1.0):
     """Numbers that stand still until chunk `from_`, then drift by `slope` a chunk, known by a filter that expects no
-    drift: after each chunk, where they are, how far they may have drifted, and where to.
+    drift: after each chunk, where they are, where it takes them to be, how far that may be off, and their ends.
     """
     rng, p, block_s = np.random.default_rng(seed), 3, 0.05
     rates = np.full(p, 1e-9)
@@ -197,13 +197,13 @@ def looks(slope, *, seed=1, from_=200, count=400):
         known.walk(rates, block_s)
         moved, J = slope * max(k + 0.5 - from_, 0.0), np.triu(40.0 * rng.normal(size=(p, p)))
         evidence = Evidence(
-            names=("a", "b", "c"), at=np.zeros(p), J=J, r=rng.normal(size=p) - J @ moved, rest=1.0, n_samples=9,
+            names=("a", "b", "c"), at=np.zeros(p), J=J, r=noise * rng.normal(size=p) - J @ moved, rest=1.0, n_samples=9,
             n_outputs=1, first=k, last=k + 1,
         )  # fmt: skip
         drift.add(evidence, known)
         known.absorb(evidence)
         drift.look(np.vstack([np.eye(p), JOINT]), 1.0)
-        found.append((moved + 0.5 * slope, *drift.begun))
+        found.append((moved + 0.5 * slope, known.q.copy(), *drift.begun))
     drift.restart()
     assert drift.begun[0].size == 0
     return found
@@ -211,13 +211,62 @@ def looks(slope, *, seed=1, from_=200, count=400):
 
 def test_a_drift_that_has_begun_is_seen_with_its_way():
     for seed in (1, 2, 3):
-        for now, ways, ends in looks(4e-3 * JOINT, seed=seed)[211:216]:
-            together = np.all(ways[:, :2] != 0.0, axis=1)
+        for now, _, ways, ends, _ in looks(4e-3 * JOINT, seed=seed)[211:216]:
+            together = np.all(ways[:, :2] > 0.5 * now[0], axis=1)
             assert together.any()
-            assert np.all(ways[together, 2] == 0.0)
+            assert np.all(ways[together, 2] < 0.05 * now[0])
             assert np.abs(ends[together, 0] - now[0]).min() < 0.35 * now[0]
 
 
+def test_what_a_drift_leaves_wrong_is_told_of_all_numbers():
+    """Without noise: how far an estimate that expects no drift is off until the next look, of what drifts and of what
+    stands still beside it.
+    """
+    slope = 4e-2 * JOINT
+    for n in (5, 7, 10, 14, 20):
+        now, taken, ways, ends, _ = looks(slope, count=201 + n, noise=0.0)[199 + n]
+        right = np.argmin(np.abs(ends - now - slope).max(axis=1))
+        np.testing.assert_allclose(ends[right], now + slope, atol=1e-4)
+        np.testing.assert_allclose(ways[right], np.abs(now + slope - taken), rtol=0.02, atol=1e-6)
+
+
 def test_without_a_drift_little_is_suspected():
-    seen = [ways.size > 0 for seed in (1, 2, 3) for _, ways, _ in looks(0.0 * JOINT, seed=seed)]
+    seen = [ways.size > 0 for seed in (1, 2, 3) for *_, ways, _, _ in looks(0.0 * JOINT, seed=seed)]
     assert np.mean(seen) < 0.06
+
+
+def test_a_ramp_is_tested_as_in_the_dense_regression():
+    """Of all rows at once: numbers known before, a ramp along each cause, and white noise."""
+    rng, p, noise = np.random.default_rng(10), 3, 1.7
+    walk, before = 0.1 * rng.uniform(size=p), ParameterFilter(np.zeros(p), np.diag(rng.uniform(1.0, 2.0, p)))
+    drift = DriftRates(walk, walk, 2.0 * walk, 0.05)
+    rows, known = [], []
+    for k in range(9):
+        J, r, at = np.triu(rng.normal(size=(p, p))), rng.normal(size=p), rng.normal(size=p)
+        before.q = rng.normal(size=p)
+        evidence = Evidence(
+            names=("a", "b", "c"), at=at, J=J, r=r, rest=1.0, n_samples=9, n_outputs=1, first=k, last=k + 1
+        )
+        drift.add(evidence, before)
+        rows.append((J, r - J @ at))
+        known.append(before.q)
+    causes = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, -2.0]])
+    lengths = np.array([3, 6])
+    statistics, each = drift.ramps(lengths, causes, noise)
+    for n, found, (off, ends, spread) in zip(lengths, statistics, np.swapaxes(each, 0, 1), strict=True):
+        J, left = (np.concatenate(x) for x in zip(*rows[-n:], strict=True))
+        P, w = before.covariance + n * 0.025 * np.diag(walk), np.repeat((np.arange(n) + 0.5) / n, p)
+        for statistic, cause, b, end, variance in zip(found, causes, off, ends, spread, strict=True):
+            # unknown: the numbers before the ramp, and its size
+            full = np.column_stack([J, w * (J @ cause)])
+            information = full.T @ full / noise
+            information[:p, :p] += np.linalg.inv(P)
+            covariance = np.linalg.inv(information)
+            solved = covariance @ np.r_[np.linalg.solve(P, known[-n]) - J.T @ left / noise, -full[:, p] @ left / noise]
+            on, size = cause * (n + 1) / n, solved[p]
+            alone = np.linalg.solve(information[:p, :p], information[:p, p])  # what is drawn along if there is no ramp
+            assert statistic == pytest.approx(size**2 / covariance[p, p], rel=1e-9)
+            np.testing.assert_allclose(end, solved[:p] + size * on, rtol=1e-9)
+            np.testing.assert_allclose(b, np.abs(size * (on - alone)), rtol=1e-9)
+            chance = np.diag(np.linalg.inv(information[:p, :p])) + covariance[p, p] * (on - alone) ** 2
+            np.testing.assert_allclose(variance, chance + (solved[:p] - known[-n]) ** 2, rtol=1e-9)

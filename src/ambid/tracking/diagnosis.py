@@ -215,7 +215,9 @@ class Diagnosis:
             return self._noisy(alarm, event, unexplained(evidence))
         self._log.add(event)
         self.unexplained.over()
-        self._publication.restart()
+        doubt = self._publication.restart() ** 2  # so much may have been taken for what goes on
+        for filter_ in (self._rpem.filter, *(known for _, known in self._history)):
+            filter_.walk(doubt)
         if name is not None and kind in _DISTURBED:
             self._rpem.filter.widen(self._rpem.numbers.direction(name), _STRAY * abs(alarm.size))
             self._rpem.drift.suspected |= self._rpem.numbers.direction(name) != 0.0  # it may go on as it has begun

@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -153,6 +153,14 @@ class Gate:
     def restart(self) -> None:
         """Drop the candidate and end the probation: data from before a change say nothing of what holds now."""
         self._candidate = self._before = None
+
+    def doubt(self) -> Array:
+        """Let the band of numbers that are on probation hold those before, too; return how far they moved, (p,)."""
+        now, before = self.accepted, self._before or self.accepted
+        moved = now.values - before.values
+        if moved.any():
+            self._history[-1] = replace(now, covariance=now.covariance + np.diag(moved**2))
+        return moved
 
     def judge(self, evidence: Evidence, t: float) -> Event | None:
         """Take in a block, ended at `t` (s of record), from after the candidate was formed: ``accepted``, ``refused``,
@@ -456,9 +464,13 @@ class Publication:
         """Published numbers."""
         return self.gate.accepted
 
-    def restart(self) -> None:
-        """Drop what waits: data from before a change say nothing of what holds now."""
+    def restart(self) -> Array:
+        """Drop what waits: data from before a change say nothing of what holds now. Return how far the numbers that are
+        on probation have moved, (p,): they may have been taken for what goes on.
+        """
+        moved = self.gate.doubt()
         self.gate.restart()
+        return moved
 
     def propose(self, t: float, why: str) -> None:
         """Offer the working estimate. `t`: s of record."""

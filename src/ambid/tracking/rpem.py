@@ -23,7 +23,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.recursive.estimator import covariance_of, factors_of
 from ambid.recursive.square_root_kernels import deviations, walk, widen
 from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
-from ambid.tracking.kernels import absorb, filter_ring, ramps, smooth_ring
+from ambid.tracking.kernels import absorb, filter_ring, smooth_ring
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
 
 Flags = NDArray[np.bool_]
@@ -114,13 +114,14 @@ _RAMPS = np.array([5, 7, 10, 14, 20])  # chunks since which something may drift 
 # statistics from which it may be so: chance passes each as often, in 3e-4 of the cases for each chunk of the window
 _BEGUN = np.array([10.1, 9.5, 8.8, 8.2, 7.6])
 _ALIKE = 9.2  # by which statistics of drifts differ by chance in one of a hundred cases
+_BETWEEN = 0.02  # of a statistic, that is lost where a drift began in the middle between two windows
 
 
 class DriftRates:
     """Variances per second of the walks, from `start` (p,) within `floor` and `ceiling` (p,): equal ones are not
     adapted. `block_s`: length of the evidence to come, s; `adapts`: whether they are found from the data; `walks`:
     whether any variance is, or may become, positive; `suspected` (p,): which seem to have begun to walk, to be set;
-    `begun`: how far steady drifts that may have begun take the numbers until the next look, and where to, both (n, p).
+    `begun`: of steady drifts that may have begun, as of `ramps`, (3, n, p).
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
@@ -134,7 +135,7 @@ class DriftRates:
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
         self._H, self._g = np.zeros((room, p, p)), np.zeros((room, p))
-        self.begun = self._none = np.zeros((0, p)), np.zeros((0, p))
+        self.begun = self._none = np.zeros((3, 0, p))
         self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
         self._chunk = EvidenceSum(p)
         self._count = self._next = self._since = self._looks = 0
@@ -204,16 +205,37 @@ class DriftRates:
         windows = int(np.searchsorted(_RAMPS, self._count, side="right"))
         if not windows:
             return
-        T, sizes = np.empty((2, windows, len(toward)))
-        walk, last = 0.5 * self._chunk_s * self.variance, self._next - 1
-        ramps(self._H, self._g, self._q, self._P, last, _RAMPS[:windows], walk, toward, noise, T, sizes)
-        least = np.maximum(_BEGUN[:windows, None], T.max() - _ALIKE)
-        likely = least < T
+        T, ends = self.ramps(_RAMPS[:windows], toward, noise)
+        likely = np.maximum(_BEGUN[:windows, None], (1.0 - _BETWEEN) * T.max() - _ALIKE) < T
         if likely.any():
-            window, cause = np.nonzero(likely)
-            n = _RAMPS[window]
-            ways = (sizes[window, cause] * (n + 1) / n)[:, None] * toward[cause]
-            self.begun = ways, self._q[self._next - n] + ways
+            self.begun = ends[:, likely]
+
+    def ramps(self, lengths: NDArray[np.int64], toward: Array, noise: float) -> tuple[Array, Array]:
+        """Return statistics (n_lengths, n_causes) of ramps w d, w from 0 to 1 over the last `lengths` chunks, along
+        `toward` (n_causes, p), beside numbers known up to P before them; and of each by how much an estimate that knows
+        of no ramp is off until the next look, where the numbers are then, and the variance of that, (3, n_lengths,
+        n_causes, p).
+
+        The score of a ramp is d^T g_w - (H_w d)^T S g, of variance d^T H_ww d - (H_w d)^T S H_w d, S = (P^-1 + H)^-1;
+        g_w, H_w, H_ww are weighted by w and its square.
+        """
+        age = np.arange(lengths[-1])
+        last, at, n = (self._next - 1 - age) % _WINDOW, lengths - 1, lengths[:, None].astype(float)
+        first, moments = last[at], (age + 0.5) ** np.arange(3)[:, None] / noise
+        H, H1, H2 = np.cumsum(moments[:, :, None, None] * self._H[last], axis=1)[:, at]
+        g, g1 = np.cumsum(moments[:2, :, None] * self._g[last], axis=1)[:, at]
+        Hw, Hww, q = H - H1 / n[..., None], H - (2.0 * H1 - H2 / n[..., None]) / n[..., None], self._q[first]
+        P = self._P[first] + 0.5 * n[..., None] * np.diag(self._chunk_s * self.variance)
+        S, gw = np.linalg.solve(np.eye(q.shape[1]) + P @ H, P), g - g1 / n + (Hw @ q[..., None])[..., 0]
+        slopes, moved = toward @ Hw, (S @ (g[..., None] + H @ q[..., None]))[..., 0][:, None]
+        drawn = slopes @ S
+        score = gw @ toward.T - (slopes * moved).sum(axis=2)
+        power = np.maximum(((toward @ Hww) * toward - drawn * slopes).sum(axis=2), 1e-30)[..., None]
+        size, on = -score[..., None] / power, (n[..., None] + 1.0) / n[..., None] * toward
+        left = moved + size * drawn  # of what was known before: a drift that is no ramp since then shows in it
+        spread = np.diagonal(S, axis1=1, axis2=2)[:, None] + (on - drawn) ** 2 / power + left**2
+        ends = np.array([np.abs(size * (on - drawn)), q[:, None] - left + size * on, spread])
+        return score**2 / power[..., 0], ends
 
     @property
     def risen(self) -> Array:

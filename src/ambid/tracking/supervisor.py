@@ -61,7 +61,7 @@ class Supervisor:
         self._spoken = False  # whether there has been any
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
         # what the parameters were made of
-        self._shown: tuple[Accepted, dict[str, bool], bool, tuple[Array, Array]] | None = None
+        self._shown: tuple[Accepted, dict[str, bool], bool, Array] | None = None
         self._parameters: dict[str, TrackedValue] = {}
 
     @property
@@ -79,10 +79,12 @@ class Supervisor:
         """Published physical parameters, SI; stale where they are not informed, or known to be no longer right."""
         source = (self.publication.accepted, self._fresh, self._trusted(), self.rpem.drift.begun)
         if self._shown is None or any(a is not b for a, b in zip(self._shown, source, strict=True)):
-            accepted, fresh, trusted, (ways, ends) = self._shown = source
-            # the part of a drift that is not followed yet, as if it were chance
-            left = np.minimum(np.abs(ends - accepted.values), np.abs(ways)).max(axis=0, initial=0.0)
-            accepted = replace(accepted, covariance=accepted.covariance + np.diag(left**2))
+            accepted, fresh, trusted, (ways, ends, spread) = self._shown = source
+            # where a drift is not followed yet: the rest of it, as if it were chance, beside what is known under it
+            variance = accepted.covariance.diagonal()
+            held = np.maximum(variance, spread) + np.minimum(np.abs(ends - accepted.values), ways) ** 2
+            more = np.diag((held - variance).max(axis=0, initial=0.0))
+            accepted = replace(accepted, covariance=accepted.covariance + more)
             now = {name: one and trusted for name, one in fresh.items()}
             self._parameters = published(self.rpem.numbers, accepted, "parameter", now)
         return dict(self._parameters)
