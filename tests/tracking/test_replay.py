@@ -60,8 +60,6 @@ def test_stamps_that_are_uniform_number_the_samples_in_turn():
     jitter = np.random.default_rng(0).uniform(-0.02, 0.02, 1000) / RATE
     for stamps in (TIME, TIME * (1 + 1e-4), TIME + jitter):
         np.testing.assert_array_equal(numbers_from_time(stamps, X, RATE)[0], np.arange(1000))
-    assert numbers_from_time(TIME, X, RATE)[2] == 0
-    assert numbers_from_time(TIME + jitter, X, RATE)[2] > 400
 
 
 def test_rows_that_are_missing_leave_a_gap():

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record import Record
-from ambid.record.sampling import JITTER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,7 +89,6 @@ class Replay:
     time_s: Array  # (n_rows,), s, stamp of each row
     rate_hz: float
     block_samples: int  # a block is shorter where the numbers do not follow on each other, and at the end
-    irregular: int = 0  # stamps that are more than 1 % of a period off the grid of the samples beside them
 
     def since(self, first: int) -> Replay:
         """Return the rows whose numbers are `first` or more, in the order in which they come."""
@@ -124,14 +122,14 @@ def blocks_of(
     names = record.names if channels is None else tuple(channels)
     values = np.column_stack([record[name].values for name in names])
     if time_s is None:
-        numbers, stamps, irregular = np.arange(record.n_samples, dtype=np.int64), record.time_s, 0
+        numbers, stamps = np.arange(record.n_samples, dtype=np.int64), record.time_s
     else:
         stamps = np.array(time_s, dtype=np.float64)
         if stamps.shape != (record.n_samples,):
             raise RecordError(
                 f"{stamps.size} time stamps do not fit {record.n_samples} samples; each row has one. Correct time_s"
             )
-        numbers, placed, irregular = numbers_from_time(stamps, values, record.rate_hz)
+        numbers, placed = numbers_from_time(stamps, values, record.rate_hz)
         values[~placed] = np.nan
         stamped = np.flatnonzero(np.isfinite(stamps))
         last = stamped[np.maximum(np.searchsorted(stamped, np.arange(stamps.size), side="right") - 1, 0)]
@@ -143,15 +141,13 @@ def blocks_of(
         time_s=stamps,
         rate_hz=record.rate_hz,
         block_samples=block_samples,
-        irregular=irregular,
     )
 
 
-def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
+def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number the rows of a damaged record by their stamps; `values` tell repeated rows from a clock that was set back.
     Returns int64 `numbers`, 0 for the first row, those without a stamp following the one before; bool `placed`, false
-    where it stays open which samples these are; `irregular`: intervals off a whole number of periods by more than 1 %
-    of one.
+    where it stays open which samples these are.
     """
     stamped = np.flatnonzero(np.isfinite(time_s))
     rows = np.diff(stamped)
@@ -170,7 +166,6 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
         )
     longest = max(_LONGEST_GAP_S * rate_hz, 10.0 * time_s.size)
     whole = np.rint(np.clip(advance, -(2.0**53), 2.0**53)).astype(np.int64)
-    irregular = int((np.abs(advance - whole) > JITTER * rows).sum())
     whole = np.where(whole > longest, rows, whole)  # the clock was set: nobody waits so long within a record
     placed = np.zeros(time_s.size, dtype=bool)
     placed[stamped] = True
@@ -178,7 +173,7 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
         placed[stamped[k] : stamped[k + 1]] = True
     steps = np.ones(time_s.size - 1, dtype=np.int64)
     steps[stamped[1:] - 1] = whole - (rows - 1)
-    return _counted(steps, values), placed, irregular
+    return _counted(steps, values), placed
 
 
 def _counted(steps: NDArray[np.int64], values: Array) -> NDArray[np.int64]:
