@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from types import MappingProxyType
 from typing import Literal, get_args
 
 import numpy as np
@@ -310,34 +309,18 @@ def _squared_length(d: Array, covariance: Array) -> float:
 
 
 class DecisionLog:
-    """Keep the last events and count all. `capacity`: events kept."""
+    """Count the events of each kind, and pass them to a `listener`."""
 
-    def __init__(self, capacity: int = 1000, listener: Callable[[Event], None] | None = None) -> None:
-        if capacity < 1:
-            raise EstimationError(f"a log of {capacity} events keeps nothing. Give a capacity of 1 or more")
-        self._events: deque[Event] = deque(maxlen=capacity)
-        self._counts: dict[str, int] = {}
+    def __init__(self, listener: Callable[[Event], None] | None = None) -> None:
+        self.counts: Counter[str] = Counter()
         self._listener, self._lock = listener, threading.Lock()
 
     def add(self, event: Event) -> None:
-        """Keep an event; the oldest one goes if there is no room."""
+        """Count an event, of any thread."""
         with self._lock:
-            self._events.append(event)
-            self._counts[event.kind] = self._counts.get(event.kind, 0) + 1
+            self.counts[event.kind] += 1
         if self._listener is not None:
             self._listener(event)
-
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """Those that are kept, the oldest first."""
-        with self._lock:
-            return tuple(self._events)
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """How many events of each kind there were, those no longer kept included."""
-        with self._lock:
-            return MappingProxyType(dict(self._counts))
 
 
 Flag = Literal["track", "hold", "accept", "revert"]

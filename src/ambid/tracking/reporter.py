@@ -148,7 +148,7 @@ class Reporter:
             updates=s.publication.updates,
             rejected_samples=self.rejected,
             changes=tuple(s.diagnosis.changes),
-            counts=s.log.counts,
+            counts=dict(s.log.counts),
             latency=latency,
             complete=complete,
             update_s=s.diagnosis.update_s,
