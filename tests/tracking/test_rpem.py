@@ -202,10 +202,9 @@ def looks(slope, *, seed=1, from_=200, count=400, noise=1.0):
         )  # fmt: skip
         drift.add(evidence, known)
         known.absorb(evidence)
-        drift.look(np.vstack([np.eye(p), JOINT]), 1.0)
-        found.append((moved + 0.5 * slope, known.q.copy(), *drift.begun))
+        found.append((moved + 0.5 * slope, known.q.copy(), *drift.look(np.vstack([np.eye(p), JOINT]), 1.0)))
     drift.restart()
-    assert drift.begun[0].size == 0
+    assert drift.look(np.eye(p), 1.0).size == 0
     return found
 
 

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Estimate
-from ambid.recursive.estimator import covariance_of, factors_of
+from ambid.recursive.estimator import as_blocks, covariance_of, factors_of
 from ambid.recursive.square_root_kernels import deviations, walk, widen
-from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
+from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, linearise
 from ambid.tracking.kernels import absorb, filter_ring, smooth_ring
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
 
@@ -120,8 +120,7 @@ _BETWEEN = 0.02  # of a statistic, that is lost where a drift began in the middl
 class DriftRates:
     """Variances per second of the walks, from `start` (p,) within `floor` and `ceiling` (p,): equal ones are not
     adapted. `block_s`: length of the evidence to come, s; `adapts`: whether they are found from the data; `walks`:
-    whether any variance is, or may become, positive; `suspected` (p,): which seem to have begun to walk, to be set;
-    `begun`: of steady drifts that may have begun, as of `ramps`, (3, n, p).
+    whether any variance is, or may become, positive; `suspected` (p,): which seem to have begun to walk, to be set.
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
@@ -135,7 +134,6 @@ class DriftRates:
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
         self._H, self._g = np.zeros((room, p, p)), np.zeros((room, p))
-        self.begun = self._none = np.zeros((3, 0, p))
         self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
         self._chunk = EvidenceSum(p)
         self._count = self._next = self._since = self._looks = 0
@@ -194,21 +192,20 @@ class DriftRates:
             if np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0):
                 present.set(np.where(active, q, present.q), P)
 
-    def look(self, toward: Array, noise: float) -> None:
-        """Look, where a chunk is complete, for ramps of the causes `toward` (n_causes, p) in windows up to now: those
-        that chance does not make, and that explain the data about as well as the likeliest, have `begun`; `noise`: the
-        residual's variance.
+    def look(self, toward: Array, noise: float) -> Array | None:
+        """Look, where a chunk is complete, else None, for ramps of the causes `toward` (n_causes, p) in windows up to
+        now; return those that chance does not make, and that explain the data about as well as the likeliest: by how
+        much the numbers are off, where they are, with what variance, (3, n, p), as of `ramps`; `noise`: the residual's
+        variance.
         """
-        if not self.adapts or self._chunk.blocks:
-            return
-        self.begun = self._none
+        if self._chunk.blocks:
+            return None
         windows = int(np.searchsorted(_RAMPS, self._count, side="right"))
         if not windows:
-            return
+            return np.zeros((3, 0, self.variance.size))
         T, ends = self.ramps(_RAMPS[:windows], toward, noise)
         likely = np.maximum(_BEGUN[:windows, None], (1.0 - _BETWEEN) * T.max() - _ALIKE) < T
-        if likely.any():
-            self.begun = ends[:, likely]
+        return np.asarray(ends[:, likely])
 
     def ramps(self, lengths: NDArray[np.int64], toward: Array, noise: float) -> tuple[Array, Array]:
         """Return statistics (n_lengths, n_causes) of ramps w d, w from 0 to 1 over the last `lengths` chunks, along
@@ -246,7 +243,6 @@ class DriftRates:
         """Forget the window: a jump in it would pass for drift."""
         self._count = self._next = self._since = self._chunk.blocks = 0
         self.suspected[:] = False
-        self.begun = self._none
 
     def _raise(self, ratio: Array) -> None:
         factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
@@ -334,14 +330,15 @@ class PhysicalRpem:
         """Return an independent estimator in the same state."""
         return copy.deepcopy(self, {id(self.numbers): self.numbers})
 
-    def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
+    def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike = ()) -> Array:
         """Take in one sample or a block, SI; return innovations, NaN for a rejected sample. `forcing` (2,) or
         (n_samples, 2), for a tracked unbalance: (speed/top speed)^2 times cosine and sine of the angle.
         """
-        samples = checked(self.numbers, inputs, outputs, forcing)
-        k, n = 0, samples.y.shape[0]
-        if n == 1:
-            return self._one(samples).reshape(np.shape(outputs))
+        problem = self.numbers.problem
+        u, y, shape = as_blocks("tracking", inputs, outputs, problem.u.shape[1], problem.y.shape[1])
+        turning = as_blocks("unbalance", forcing, outputs, 2, y.shape[1])[0] if self.numbers.synchronous else None
+        samples = Samples(u=u, y=y, forcing=turning)
+        k, n = 0, y.shape[0]
         errors = np.full(samples.y.shape, np.nan)
         while k < n:
             n_taken, innovations, evidence = self.stream.feed(samples.part(k))
@@ -354,19 +351,7 @@ class PhysicalRpem:
                 self.n_rejected += 1
                 k += 1
                 self.stream.restart(self.stream.sample + 1)
-        return errors.reshape(np.shape(outputs))
-
-    def _one(self, samples: Samples) -> Array:
-        """Take in one sample; the same as below, without what only a block needs."""
-        n_taken, errors, evidence = self.stream.feed(samples)
-        self.n_used += n_taken
-        if evidence is not None:
-            self.take(evidence)
-        elif not n_taken:
-            self.n_rejected += 1
-            self.stream.restart(self.stream.sample + 1)
-            return np.full(samples.y.shape, np.nan)
-        return errors
+        return errors.reshape(shape)
 
     def take(self, evidence: Evidence) -> None:
         """Take in the evidence of a block."""
@@ -378,9 +363,12 @@ class PhysicalRpem:
         self.drift.add(evidence, self.filter)
         self.filter.absorb(evidence, self.noise_of(evidence))
         self.drift.adapt(self.filter, self.noise)
-        self.drift.look(self._causes, self.noise)
         self.follow_noise(evidence)
         self.refresh()
+
+    def begun(self) -> Array | None:
+        """Return drifts that may have begun, as of `DriftRates.look`."""
+        return self.drift.look(self._causes, self.noise)
 
     def predict(self) -> None:
         """Let the numbers walk over one block; what a joint cause moves together, where two of them have begun to."""

@@ -62,6 +62,7 @@ class Supervisor:
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
         # what the parameters were made of
         self._shown: tuple[Accepted, dict[str, bool], bool, Array] | None = None
+        self._begun = np.zeros((3, 0, numbers.start.size))  # drifts that may have begun
         self._parameters: dict[str, TrackedValue] = {}
 
     @property
@@ -77,7 +78,7 @@ class Supervisor:
     @property
     def parameters(self) -> dict[str, TrackedValue]:
         """Published physical parameters, SI; stale where they are not informed, or known to be no longer right."""
-        source = (self.publication.accepted, self._fresh, self._trusted(), self.rpem.drift.begun)
+        source = (self.publication.accepted, self._fresh, self._trusted(), self._begun)
         if self._shown is None or any(a is not b for a, b in zip(self._shown, source, strict=True)):
             accepted, fresh, trusted, (ways, ends, spread) = self._shown = source
             # where a drift is not followed yet: the rest of it, as if it were chance, beside what is known under it
@@ -194,6 +195,8 @@ class Supervisor:
             if confirmed or (self.diagnosis.settling and self.publication.accepted is not accepted):
                 self.diagnosis.settling = False
                 self.level.restart()
+        begun = rpem.begun()
+        self._begun = self._begun if begun is None else begun
         if self.diagnosis.renewed:
             self._activate()
         if usable or self.diagnosis.doubted:  # a knock that is set aside is no error of the model
