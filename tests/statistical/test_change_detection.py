@@ -34,7 +34,8 @@ def alarms(detector, J, seed, n=N):
 def test_false_alarms_come_no_oftener_than_allowed(condition, scale):
     """Allowed one a second; they may be fewer, as the allowance holds for the worst case."""
     J = triangle(7, 1, condition=condition) * scale
-    detector = ChangeDetector(P7, block_s=BLOCK_S, false_alarms_per_hour=3600.0, drift=1e-9)
+    detector = ChangeDetector(P7, block_s=BLOCK_S, false_alarms_per_hour=3600.0)
+    detector.drift[:] = 1e-9
     begun, kinds = alarms(detector, J, 2)
     assert SECONDS / 12 <= begun <= SECONDS + 3 * np.sqrt(SECONDS)
     assert set(kinds) == {"moved", "unexplained"}
@@ -43,7 +44,8 @@ def test_false_alarms_come_no_oftener_than_allowed(condition, scale):
 def test_quiet_running_gives_no_alarm():
     """At the default of one in twenty hours a minute of quiet running gives one in a thousand cases."""
     for seed, condition in ((3, 1.0), (4, 1e6)):
-        detector = ChangeDetector(P7, block_s=BLOCK_S, drift=1e-9)
+        detector = ChangeDetector(P7, block_s=BLOCK_S)
+        detector.drift[:] = 1e-9
         assert alarms(detector, triangle(7, seed, condition=condition), seed)[0] == 0
         assert detector.noise == pytest.approx(1.0, abs=0.02 * np.sqrt(60 / SECONDS))
         assert np.median(detector.overdispersion) < 1.1

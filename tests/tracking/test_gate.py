@@ -284,8 +284,6 @@ def test_blocks_that_are_not_finite_are_not_used_and_wrong_shapes_refused():
     assert gate.pending
     with pytest.raises(EstimationError, match="5 finite"):
         gate.propose(np.zeros(4), np.eye(4), 1.0, "x")
-    with pytest.raises(EstimationError, match="kept"):
-        gate_at(np.zeros(5), rng, kept=1)
     assert gate_at(np.zeros(5), rng).accept(0.0).kind == "refused"
 
 

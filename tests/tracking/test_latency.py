@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ambid.errors import EstimationError
 from ambid.tracking.engine import LatencyStatistics
 
 
@@ -54,14 +53,3 @@ def test_beyond_the_last_bin_the_largest_is_exact():
 def test_without_blocks_there_is_nothing_to_report():
     assert LatencyStatistics().summary() is None
     assert np.isnan(LatencyStatistics().quantile(0.5))
-
-
-@pytest.mark.parametrize("latency", [float("nan"), float("inf")])
-def test_what_is_no_number_is_refused(latency):
-    with pytest.raises(EstimationError, match="cannot be counted"):
-        filled([latency])
-
-
-def test_a_fraction_beyond_one_is_refused():
-    with pytest.raises(EstimationError, match="within 0 and 1"):
-        filled([1.0]).quantile(1.1)

@@ -4,7 +4,6 @@ import math
 import numpy as np
 import pytest
 
-from ambid.errors import EstimationError
 from ambid.tracking.monitors import ErrorLevel
 from tests.tracking.evidences import evidence, triangle
 
@@ -60,10 +59,3 @@ def test_a_block_that_is_not_finite_changes_nothing():
     bad = dataclasses.replace(evidence(J, np.zeros(5), 0, np.random.default_rng(0)), rest=math.nan)
     assert level.update(bad, np.zeros(5)) == before
     assert level.n_blocks == 10
-
-
-def test_limits_that_make_no_sense_are_refused():
-    with pytest.raises(EstimationError, match="release"):
-        ErrorLevel(1.0, 1.2, 5)
-    with pytest.raises(EstimationError, match="0 blocks"):
-        ErrorLevel(1.5, 1.2, 0)

@@ -46,10 +46,6 @@ class LatencyStatistics:
 
     def add(self, latency_s: float) -> None:
         """Count a block."""
-        if not latency_s < float("inf"):
-            raise EstimationError(
-                f"a latency of {latency_s} s cannot be counted; it must be a number. Correct the clock"
-            )
         at = 0  # of what the clock cannot resolve
         if latency_s > _LOWEST:
             at = ceil(_PER_DECADE * log10(latency_s / _LOWEST))
@@ -61,8 +57,6 @@ class LatencyStatistics:
         """Return the latency in s that this fraction of blocks does not exceed: upper edge of its bin, or the largest
         latency if less; NaN without any block.
         """
-        if not 0 <= fraction <= 1:
-            raise EstimationError(f"the fraction of a quantile is {fraction}; it must lie within 0 and 1. Correct it")
         if not self.count:
             return float("nan")
         at = int(np.searchsorted(np.cumsum(self._bins), max(fraction * self.count, 1.0)))

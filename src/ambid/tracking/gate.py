@@ -100,8 +100,6 @@ class Gate:
     ) -> None:
         from scipy.special import chdtri, ndtri
 
-        if not (kept >= 2 and 1 <= blocks <= longest and probation >= 0 and 0 < level < 0.5 and 0 < back < 0.5):
-            raise EstimationError("gate: kept >= 2, 1 <= blocks <= longest, levels between 0 and 0.5. Correct them")
         self.names, self.overdispersion = tuple(names), overdispersion
         self.last: Comparison | None = None
         self._apart, self._blocks, self._longest, self._probation = apart_s, blocks, longest, probation

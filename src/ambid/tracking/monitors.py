@@ -15,10 +15,10 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, counted, nearest
+from ambid.errors import EstimationError, counted
 from ambid.recursive.lines import Event
 from ambid.recursive.square_root_kernels import deviations
 from ambid.tracking.evidence import Evidence
@@ -31,11 +31,6 @@ class ErrorLevel:
     """
 
     def __init__(self, limit: float, release: float, window_blocks: int) -> None:
-        if not (0 < release <= limit and window_blocks >= 1):
-            raise EstimationError(
-                f"error level: 0 < release <= limit, a window of a block or more; got release {release:g}, limit "
-                f"{limit:g}, {counted(window_blocks, 'block')}. Correct them"
-            )
         self.limit, self.release = limit, release
         self.above, self.n_blocks = False, 0
         self._squares, self._weights = [0.0] * window_blocks, [0.0] * window_blocks
@@ -103,16 +98,6 @@ class ExcitationMonitor:
         enough: float = 0.01,
     ) -> None:
         self.names, p = tuple(names), len(names)
-        for name in (*reference_rate, *held):
-            if name not in self.names:
-                raise EstimationError(f"excitation: {name!r} is not tracked.{nearest(name, self.names)}")
-        for name, value in reference_rate.items():
-            if not (value >= 0 and math.isfinite(value)):
-                raise EstimationError(
-                    f"reference_rate of {name} is {value:g}; it is an information rate. Give 0 or more"
-                )
-        if not (0 < block_s < window_s and 0 < freeze <= thaw and enough >= 0):
-            raise EstimationError("excitation: 0 < block_s < window_s, 0 < freeze <= thaw, enough >= 0. Correct them")
         self._judged = tuple(name for name in self.names if name in reference_rate)
         self._held = np.array([self.names.index(name) for name in held], dtype=np.int64)
         self._at = tuple(self.names.index(name) for name in self._judged)
@@ -259,7 +244,7 @@ class ChangeDetector:
 
     `names`: all numbers of the evidence; `joints`: causes that move several of them, each with the direction (p,);
     `block_s`, `longest_s`: a block and the longest window, s; `false_alarms_per_hour`: in quiet running with Gaussian
-    evidence; `drift`: (p,), or float; `walking`: (p,), that part of it which blurs a window; `suspected`: (p,), which
+    evidence; `drift`: (p,); `walking`: (p,), that part of it which blurs a window; `suspected`: (p,), which
     numbers seem to have begun to drift; `threshold`: of T_j; `windows`: lengths, blocks; `overdispersion`: where
     learning starts, then (n_windows, n_hypotheses + 2), the last two all numbers together and the unexplained part;
     `noise`: its usual level per degree of freedom. May be set again any time.
@@ -274,7 +259,6 @@ class ChangeDetector:
         joints: Mapping[str, Array] | None = None,
         false_alarms_per_hour: float = 0.05,
         longest_s: float = 0.5,
-        drift: ArrayLike | None = None,
         overdispersion: float = 1.0,
         settle_s: float = 0.0,
         margin: float = 9.2,
@@ -282,13 +266,6 @@ class ChangeDetector:
         self.names = tuple(names)
         joints = joints or {}
         self.hypotheses = (*(self.names if hypotheses is None else hypotheses), *joints)
-        for name in self.hypotheses:
-            if name not in self.names and name not in joints:
-                raise EstimationError(f"hypothesis {name!r} is not a tracked parameter.{nearest(name, self.names)}")
-        if not (block_s > 0 and false_alarms_per_hour > 0 and overdispersion >= 1):
-            raise EstimationError(
-                "block_s and false_alarms_per_hour must be positive, overdispersion at least 1. Correct them"
-            )
         self._margin = margin
         p, tests, longest = len(self.names), len(self.hypotheses) + 2, max(_FEWEST, round(longest_s / block_s))
         levels = 1 + max(int(math.log2(longest / 3)), 0)
@@ -307,9 +284,7 @@ class ChangeDetector:
         self._counts, self._blocks, self._point = np.zeros(levels, dtype=np.int64), 0, np.zeros(p)
         self._history = np.zeros((longest + 2, p, p + 1))
         self._learned = np.full((len(lengths), tests), math.log(overdispersion))
-        self._drift = np.zeros(p)
-        self.drift = self._drift if drift is None else drift
-        self.walking = np.zeros(p)
+        self.drift, self.walking = np.zeros(p), np.zeros(p)
         self.noise, self._longest = overdispersion, longest
         self._wait = 0  # blocks until statistics are quiet again
         self._scratch = np.zeros((p, p + 1)), np.zeros((p + 1, p)), np.zeros((p, p)), np.zeros((p, p + 1))
@@ -320,14 +295,6 @@ class ChangeDetector:
     def overdispersion(self) -> Array:  # noqa: D102
         return np.asarray(np.exp(self._learned[: len(self.windows)]))
 
-    @property
-    def drift(self) -> Array:  # noqa: D102
-        return self._drift.copy()
-
-    @drift.setter
-    def drift(self, value: ArrayLike) -> None:
-        self._drift[:] = value
-
     def update(self, evidence: Evidence, estimate: Array, covariance: Array) -> Alarm | None:
         """Take in a block; `estimate` (p,), `covariance` (p, p): predicted for it from all data before. Returns a
         change as long as a window passes its threshold: until `restart`, or until the estimate has followed.
@@ -335,10 +302,6 @@ class ChangeDetector:
         if evidence.first < self._from:
             return None
         p = len(self.names)
-        if evidence.r.size != p:
-            raise EstimationError(
-                f"the evidence has {evidence.r.size} parameters; the detector watches {p}. Give the same"
-            )
         if not self._blocks:
             self._point = evidence.at
         slot = self._counts[0] % 4
@@ -356,7 +319,7 @@ class ChangeDetector:
         self._found[:, 0] = self._found[:, 10:] = 0.0
         passed = watch(
             self._bases, self._notes, self._counts, self._history, self._learned, self._marks, self._toward,
-            self._drift, self.walking / _WITHIN, self._longest, (-1.0 if settling else _GAIN) if calm else 0.0,
+            self.drift, self.walking / _WITHIN, self._longest, (-1.0 if settling else _GAIN) if calm else 0.0,
             self.noise, *self._scratch, self._found,
         )  # fmt: skip
         drifts = self._found[self._long, 10 : 10 + len(self.hypotheses)].max(axis=0, initial=0.0) > _DRIFTS
