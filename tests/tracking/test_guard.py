@@ -16,7 +16,7 @@ X = signal(6000)
 
 def fed(stream, **settings):
     """Every stretch and rejection of a stream, the guard, and after which block each came."""
-    guard = StreamGuard(RATE, 3, **({"limits": 1e3, "stuck": None} | settings))
+    guard = StreamGuard(RATE, 3, **({"limits": 1e3, "watched": [False] * 3} | settings))
     out = [(k, passed) for k, block in enumerate(stream) for passed in guard.take(block)]
     out += [(len(stream), passed) for passed in guard.flush()]
     return guard, out
@@ -219,7 +219,7 @@ def test_an_overlap_with_other_values_is_refused_and_starts_the_memory_anew():
 
 def test_blocks_are_neither_changed_nor_kept():
     buffer = np.empty((100, 3))
-    guard = StreamGuard(RATE, 3, stuck=None)
+    guard = StreamGuard(RATE, 3, watched=[False] * 3)
     kept = []
     for block in blocks(X):
         buffer[:] = block.values
@@ -239,9 +239,9 @@ def test_memory_stays_bounded_whatever_comes():
         assert len(guard._order._refused) <= 8
 
 
-@pytest.mark.parametrize("wrong", [{"reorder": -1}, {"patience_s": 0.0}, {"stuck": 1}])
+@pytest.mark.parametrize("wrong", [{"reorder": -1}, {"patience_s": 0.0}, {"watched": [True]}])
 def test_settings_that_make_no_guard_are_refused(wrong):
-    with pytest.raises(EstimationError, match=r"(Correct it|stuck)"):
+    with pytest.raises(EstimationError, match=r"Correct it"):
         StreamGuard(RATE, 3, **wrong)
     with pytest.raises(EstimationError, match="rate"):
         StreamGuard(0.0, 3)

@@ -25,7 +25,7 @@ def record(values=X):
 def replayed(rows, stamps=TIME, values=X, size=100):
     """Numbers, values and rejections of what a guard gives of these rows of the record, with these stamps."""
     replay = blocks_of(record(values[rows]), size, time_s=np.asarray(stamps)[rows])
-    guard = StreamGuard(RATE, 2, stuck=None)
+    guard = StreamGuard(RATE, 2, watched=[False] * 2)
     out = [passed for block in replay for passed in guard.take(block)] + guard.flush()
     kept = [s for s in out if isinstance(s, Stretch)]
     numbers = np.concatenate([np.arange(s.first, s.first + len(s.values)) for s in kept])

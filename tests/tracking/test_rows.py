@@ -76,14 +76,8 @@ def test_a_commanded_channel_may_rest():
     resting = X.copy()
     resting[5000:7000, 0] = 0.0
     assert given(resting)[0].size == 8000 - 1999
-    assert given(resting, stuck=(None, 30, 30))[0].size == 8000
-    assert given(resting, stuck=None)[0].size == 8000
-
-
-def test_a_given_run_needs_no_learning():
-    frozen = X.copy()
-    frozen[10:60, 2] = 7.0
-    assert given(frozen, stuck=5)[0].size == 8000 - 49
+    assert given(resting, watched=(False, True, True))[0].size == 8000
+    assert given(resting, watched=(False, False, False))[0].size == 8000
 
 
 def test_limits_are_each_channel_s_own():
@@ -115,9 +109,7 @@ def test_without_limits_only_what_no_bearing_can_show_is_refused():
         ({"limits": [1.0, 2.0]}, "limits"),
         ({"limits": -1.0}, "limits"),
         ({"limits": np.nan}, "limits"),
-        ({"stuck": [1, 2, 3]}, "stuck"),
-        ({"stuck": [5, None]}, "stuck"),
-        ({"stuck": "often"}, "stuck"),
+        ({"watched": [True, False]}, "watched"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(settings, complaint):

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -219,12 +218,11 @@ def _guard(source: BenchRows, estimate: Estimate) -> StreamGuard:
     """A guard that watches outputs for freezing, but no input and no forcing: these may rest."""
     plant, n_f = model(estimate.model), 0 if source.forcing is None else 2
     n_u, n_y = len(plant.inputs), len(plant.outputs)
-    outputs: list[int | Literal["auto"] | None] = ["auto"] * n_y
     return StreamGuard(
         source.replay.rate_hz,
         n_u + n_y + n_f,
         limits=credible_limits(source, estimate) + [ABSURD] * n_f,
-        stuck=[*[None] * n_u, *outputs, *[None] * n_f],
+        watched=[False] * n_u + [True] * n_y + [False] * n_f,
     )
 
 

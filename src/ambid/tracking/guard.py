@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from operator import index
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +20,6 @@ from ambid.tracking.blocks import Block, Passed, RejectionKind, RowKind, Stretch
 from ambid.tracking.order import BlockOrder, Ledger, Part, SampleClock
 
 Mask = NDArray[np.bool_]
-Stuck = Literal["auto"] | None | int | Sequence[int | Literal["auto"] | None]
 
 ABSURD = 1e15  # no quantity of a bearing in SI units is that large; squares stay far from overflow
 _NORMAL_RUN = 20  # a channel with longer runs in normal work (coarse steps, a set point) is not watched
@@ -33,10 +31,12 @@ _NEVER = np.iinfo(np.int64).max
 
 class RowCheck:
     """Judges rows in order, remembering what each channel last held and how long; `limits`: largest credible
-    magnitudes, SI.
+    magnitudes, SI; `watched`: which channels may not freeze, default all.
     """
 
-    def __init__(self, n_channels: int, *, limits: ArrayLike | None = None, stuck: Stuck = "auto") -> None:
+    def __init__(
+        self, n_channels: int, *, limits: ArrayLike | None = None, watched: Sequence[bool] | None = None
+    ) -> None:
         if n_channels < 1:
             raise EstimationError(f"the stream has {n_channels} channels; it needs at least one. Correct n_channels")
         try:
@@ -49,16 +49,10 @@ class RowCheck:
             )
         self._limits = np.minimum(self._limits, np.finfo(np.float64).max)
         self._widest = float(self._limits.min())
-        each = [stuck] * n_channels if stuck is None or isinstance(stuck, (str, int)) else list(stuck)
-        wrong = any(n != "auto" if isinstance(n, str) else n is not None and n < 2 for n in each)
-        if wrong or len(each) != n_channels:
-            raise EstimationError(
-                f"stuck = {stuck!r} does not fit {n_channels} channels; it must be 'auto', None or a run of at least"
-                " 2 samples, for all or for each. Correct stuck"
-            )
-        self._learns = np.array([n == "auto" for n in each])
-        self._threshold = np.array([n if isinstance(n, int) else _NEVER for n in each], dtype=np.int64)
-        self._watches = bool(self._learns.any() or (self._threshold < _NEVER).any())
+        self._learns = np.ones(n_channels, dtype=bool) if watched is None else np.array(watched, dtype=bool)
+        if self._learns.shape != (n_channels,):
+            raise EstimationError(f"watched does not hold a word for each of {n_channels} channels. Correct it")
+        self._threshold = np.full(n_channels, _NEVER)  # samples
         self._usual = np.ones(n_channels, dtype=np.int64)  # longest run in normal work
         self._moving = np.zeros(n_channels, dtype=np.int64)  # samples of normal work
         self._last = np.full(n_channels, np.nan)
@@ -73,7 +67,7 @@ class RowCheck:
         if not np.abs(values).max() <= self._widest:
             _add(refused, "nan", ~np.isfinite(values))
             _add(refused, "range", np.abs(values) > self._limits)
-        if not self._watches:
+        if not self._learns.any():
             return refused, 0
         stuck, undecided = self._frozen(self._filled(values) if "nan" in refused else values, last)
         if stuck is not None:
@@ -165,7 +159,7 @@ class StreamGuard:
     """Takes blocks as they come and gives out clean stretches, later than all before, and a record of what it does not
     give. Up to `reorder` blocks wait for a missing one, and a gap delays as many. After damage the next sound block
     goes on; only counter and clock both set back are taken for a repetition until `patience_s` is over. `limits`:
-    largest credible magnitude of each channel, SI; `n_received`: samples that came.
+    largest credible magnitude of each channel, SI; `watched`: as of `RowCheck`; `n_received`: samples that came.
     """
 
     def __init__(
@@ -174,7 +168,7 @@ class StreamGuard:
         n_channels: int,
         *,
         limits: ArrayLike | None = None,
-        stuck: Stuck = "auto",
+        watched: Sequence[bool] | None = None,
         reorder: int = 1,
         patience_s: float = 1.0,
     ) -> None:
@@ -183,7 +177,7 @@ class StreamGuard:
                 f"a guard with reorder = {reorder}, patience_s = {patience_s} cannot work: reorder must not be"
                 " negative, patience positive. Correct it"
             )
-        self._rows = RowCheck(n_channels, limits=limits, stuck=stuck)
+        self._rows = RowCheck(n_channels, limits=limits, watched=watched)
         self._clock = SampleClock(rate_hz, _TOLERANCE / max(rate_hz, 1e-300))
         self.rate_hz, self.n_channels = rate_hz, n_channels
         self._ledger = Ledger(rate_hz)
