@@ -169,14 +169,16 @@ def test_probation_goes_on_through_small_steps_and_reverts_to_what_was_before_al
     assert len(gate.history) == 1
 
 
-def test_numbers_on_probation_are_doubted_together_with_those_before_them():
+def test_numbers_on_probation_that_moved_far_are_doubted_together_with_those_before_them():
     rng = np.random.default_rng(4)
     gate = gate_at(np.zeros(5), rng)
-    before, (q, P) = gate.accepted.values, estimate(moved(12.0), 20, rng)
+    before, (q, P) = gate.accepted, estimate(moved(12.0), 20, rng)
+    far = (q - before.values) ** 2 > 9.0 * np.diag(before.covariance)
+    assert 0 < far.sum() < 5
     gate.propose(q, P, 1.0, "after a change")
     gate.accept(1.0)
-    np.testing.assert_allclose(gate.doubt(), q - before, rtol=1e-12)
-    np.testing.assert_allclose(gate.accepted.covariance, P + np.diag((q - before) ** 2), rtol=1e-12)
+    np.testing.assert_allclose(gate.doubt(), far * (q - before.values), rtol=1e-12)
+    np.testing.assert_allclose(gate.accepted.covariance, P + np.diag(far * (q - before.values) ** 2), rtol=1e-12)
     gate.restart()
     assert not gate.doubt().any()
 

@@ -25,6 +25,7 @@ from ambid.tracking.evidence import Evidence, EvidenceSum
 from ambid.tracking.numbers import Kind, TrackedNumbers, amplitude_and_phase
 from ambid.tracking.rpem import PhysicalRpem
 
+_FAR = 9.0  # squares of standard deviations, beyond which a number that moved is another, and not better known
 _REGULAR = 1e-10  # of a correlation matrix: what keeps one without an inverse regular
 
 
@@ -152,9 +153,12 @@ class Gate:
         self._candidate = self._before = None
 
     def doubt(self) -> Array:
-        """Let the band of numbers that are on probation hold those before, too; return how far they moved, (p,)."""
+        """Let the band of numbers on probation that claim to be others hold those before, too; return how far they
+        moved, (p,).
+        """
         now, before = self.accepted, self._before or self.accepted
         moved = now.values - before.values
+        moved = np.where(moved**2 > _FAR * before.covariance.diagonal(), moved, 0.0)
         if moved.any():
             self._history[-1] = replace(now, covariance=now.covariance + np.diag(moved**2))
         return moved
