@@ -43,7 +43,6 @@ def test_flags_are_states_and_orders():
     assert operator.waiting == "accept"
     assert operator.take() == "accept"
     assert operator.take() is None
-    assert Operator(hold=True).holding
 
 
 def test_wrong_and_opposite_flags_are_refused():

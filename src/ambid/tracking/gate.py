@@ -26,6 +26,8 @@ from ambid.tracking.numbers import Kind, TrackedNumbers, amplitude_and_phase
 from ambid.tracking.rpem import PhysicalRpem
 
 _FAR = 9.0  # squares of standard deviations, beyond which a number that moved is another, and not better known
+_BLOCKS = 4  # after the candidate, before it is judged
+_LEVEL, _BACK = 0.005, 1e-4  # at which one of two tests refuses a right candidate, and at which one goes back
 _REGULAR = 1e-10  # of a correlation matrix: what keeps one without an inverse regular
 
 
@@ -72,15 +74,15 @@ class Comparison:
 class Gate:
     """Hold the accepted numbers; let others pass only if later data agree.
 
-    A candidate passes if it predicts later blocks no worse than the accepted numbers but for chance (`level` of the
+    A candidate passes if it predicts later blocks no worse than the accepted numbers but for chance (0.5 % of the
     normal distribution of the difference; twice that distance for one that claims nothing new), and if its own residual
-    is within chance (`level` of chi-squared). One that claims to be another number, which data cannot yet tell, waits,
+    is within chance (0.5 % of chi-squared). One that claims to be another number, which data cannot yet tell, waits,
     and is refused after `longest` blocks. For `probation` blocks the gate goes back if the numbers before predict
     better than chance.
 
     `start`, `covariance`: (p,), (p, p), accepted at time `t`, s; `kept`: accepted numbers to go back to, the present
-    ones included; `level`: probability that one of the two tests refuses a right candidate; `overdispersion`: of quiet
-    statistics, 1 or more, may be set anew; `last`: numbers behind the last decision.
+    ones included; `overdispersion`: of quiet statistics, 1 or more, may be set anew; `last`: numbers behind the last
+    decision.
     """
 
     def __init__(
@@ -92,21 +94,18 @@ class Gate:
         t: float = 0.0,
         kept: int = 8,
         apart_s: float = 1.0,
-        blocks: int = 4,
         longest: int = 200,
         probation: int = 200,
-        level: float = 0.005,
-        back: float = 1e-4,
         overdispersion: float = 1.0,
     ) -> None:
         from scipy.special import chdtri, ndtri
 
         self.names, self.overdispersion = tuple(names), overdispersion
         self.last: Comparison | None = None
-        self._apart, self._blocks, self._longest, self._probation = apart_s, blocks, longest, probation
+        self._apart, self._longest, self._probation = apart_s, longest, probation
         p = len(self.names)
         self._unit = np.eye(p)
-        self._z, self._z_back, self._misfit = float(-ndtri(level)), float(-ndtri(back)), float(chdtri(p, level))
+        self._z, self._z_back, self._misfit = float(-ndtri(_LEVEL)), float(-ndtri(_BACK)), float(chdtri(p, _LEVEL))
         values, P = self._checked(start, covariance)
         self._history: deque[Accepted] = deque([Accepted(values=values, covariance=P, t=t, why="at the start")], kept)
         self._candidate: Accepted | None = None
@@ -176,7 +175,7 @@ class Gate:
             return back
         if self._candidate is None:
             return None
-        if not self._trial.add(evidence) or self._trial.blocks < self._blocks:
+        if not self._trial.add(evidence) or self._trial.blocks < _BLOCKS:
             return None
         new, old = self._candidate, self.accepted
         comparison = self.last = self._compare(self._trial, new, old)
@@ -269,7 +268,7 @@ class Gate:
         if self._before is None:
             self._before = self.accepted if self._probation else None
             self._watched.clear(new.values)
-            self._next = self._blocks
+            self._next = _BLOCKS
         else:  # the trial goes on against the older numbers: a chain of small steps does not escape it
             self._watched.move(new.values)
         refined = comparison is not None and comparison.claim <= self._misfit
@@ -331,14 +330,14 @@ _FLAGS: tuple[str, ...] = get_args(Flag)
 
 
 class Operator:
-    """Flags of the operator, to be set from any thread; begins in ``hold`` or ``track``. In ``hold`` the published
+    """Flags of the operator, to be set from any thread; begins in ``track``. In ``hold`` the published
     numbers stay; ``accept`` (the candidate, now and unjudged) and ``revert`` (to the numbers before) are orders,
     carried out once.
     """
 
-    def __init__(self, *, hold: bool = False) -> None:
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._hold = hold
+        self._hold = False
         self._order: Order | None = None
 
     @property

@@ -69,6 +69,7 @@ class ErrorLevel:
 
 
 _RIDGE = 1e-3  # the numbers are of order one: one that nothing shows has a standard deviation of a thousand
+_FREEZE, _THAW = 0.02, 0.05  # times the rate at identification
 _WORSE = 1.5  # accuracy over `enough` at which a number is no longer fresh: hysteresis
 _NOTHING = 1e-100  # entries of a triangle under this become zero: the smallest numbers take long to compute with
 _FILLED = 0.5  # part of the window that has to be filled before anything is judged
@@ -77,7 +78,7 @@ _FILLED = 0.5  # part of the window that has to be filled before anything is jud
 class ExcitationMonitor:
     """Tell fresh parameters from frozen ones. A parameter's information rate is 1/(sd² window), sd the marginal
     (relative) standard deviation by the exponential window alone, offsets and all other numbers unknown. It freezes
-    below `freeze` and thaws above `thaw` times the rate at identification, unless the window gives it better than
+    below a 50th and thaws above a 20th of the rate at identification, unless the window gives it better than
     `enough` (relative): fresh.
 
     `names`: all numbers of the evidence; `block_s`, `window_s`: a block and the window's time constant, s; `fresh`: of
@@ -93,8 +94,6 @@ class ExcitationMonitor:
         held: Sequence[str] = (),
         block_s: float,
         window_s: float = 1.0,
-        freeze: float = 0.02,
-        thaw: float = 0.05,
         enough: float = 0.01,
     ) -> None:
         self.names, p = tuple(names), len(names)
@@ -105,7 +104,7 @@ class ExcitationMonitor:
         self._reference = np.array([reference_rate.get(name, 0.0) for name in self.names])
         information = np.inf if enough == 0.0 else enough**-2.0
         # information, and rate of it, below both of which a frozen number stays so, and a fresh one freezes
-        self._limits = (information, thaw * self._reference), (information / _WORSE**2, freeze * self._reference)
+        self._limits = (information, _THAW * self._reference), (information / _WORSE**2, _FREEZE * self._reference)
         self._block, self._window, self._decay = block_s, window_s, math.exp(-block_s / window_s)
         self._keep = math.sqrt(self._decay)
         self.duration_s = 0.0
@@ -180,6 +179,7 @@ _TESTS: dict[int, tuple[Literal["number", "all", "noise"], int]] = {1: ("number"
 _RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 _WITHIN = 6.0  # variance of a walk of many steps about its mean, over a step's and their number
 _SLOW, _DRIFTS = 16, 9.0  # blocks of a window, and statistic of a number in it, from which it may have begun to drift
+_MARGIN = 9.2  # by which statistics of rivals differ by chance in one of a hundred cases
 _SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and slower while settling
 
 
@@ -261,12 +261,10 @@ class ChangeDetector:
         longest_s: float = 0.5,
         overdispersion: float = 1.0,
         settle_s: float = 0.0,
-        margin: float = 9.2,
     ) -> None:
         self.names = tuple(names)
         joints = joints or {}
         self.hypotheses = (*(self.names if hypotheses is None else hypotheses), *joints)
-        self._margin = margin
         p, tests, longest = len(self.names), len(self.hypotheses) + 2, max(_FEWEST, round(longest_s / block_s))
         levels = 1 + max(int(math.log2(longest / 3)), 0)
         lengths = [1, 2, 3, 4] + [m << level for level in range(1, levels) for m in (3, 4)]
@@ -377,7 +375,7 @@ class ChangeDetector:
             sd=sd if moved else 0.0,
             statistic={"number": top, "all": joint, "noise": rest}[by],
             threshold=float(self._marks[0, place]),
-            rivals=tuple((name, value) for name, value in others if value > top - self._margin and value > 1.0),
+            rivals=tuple((name, value) for name, value in others if value > top - _MARGIN and value > 1.0),
             runner_up=others[0] if others else None,
             joint=joint,
             noise=noise,
