@@ -111,8 +111,8 @@ _ROUNDS = 10  # of raising a variance at one look
 _WITHIN = 6.0  # what may walk within a chunk, as squares of its innovations: more would be taken for other numbers
 _NOTICED = 3.0  # factor of a variance from which the recent past is filtered anew
 _RAMPS = np.array([5, 7, 10, 14, 20])  # chunks since which something may drift steadily
-# statistics from which it may be so: chance passes each as often, in 1e-3 of the cases for each chunk of the window
-_BEGUN = np.array([7.88, 7.27, 6.63, 6.04, 5.41])
+# statistics from which it may be so: chance passes each as often, in 3e-4 of the cases for each chunk of the window
+_BEGUN = np.array([10.1, 9.5, 8.8, 8.2, 7.6])
 _ALIKE = 9.2  # by which statistics of drifts differ by chance in one of a hundred cases
 _BETWEEN = 0.02  # of a statistic, that is lost where a drift began in the middle between two windows
 
