@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import unicodedata
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, overload
@@ -60,6 +61,7 @@ _ATOMS |= {
     "MPa": (1e6, _BASE["Pa"][1]),
     "GPa": (1e9, _BASE["Pa"][1]),
     "cm": (1e-2, (0, 1, 0, 0, 0)),
+    "mil": (25.4e-6, (0, 1, 0, 0, 0)),
     "kg": (1.0, (1, 0, 0, 0, 0)),
     "mg": (1e-6, (1, 0, 0, 0, 0)),
 }
@@ -167,7 +169,8 @@ def known_units() -> tuple[str, ...]:
 
 
 def _plain(text: str) -> str:
-    """Write µ, Ω, ², · in plain letters and single spaces."""
+    """Write µ, Ω, ², ·, ㎜ in plain letters and single spaces."""
+    text = re.sub("[\u3300-\u33ff]", lambda x: unicodedata.normalize("NFKC", x[0]), text)
     for fancy, letters in (("µ", "u"), ("μ", "u"), ("Ω", "ohm"), ("Ω", "ohm"), ("²", "^2"), ("·", " "), ("*", " ")):
         text = text.replace(fancy, letters)
     return re.sub(r"\s*/\s*", "/", " ".join(text.split()))

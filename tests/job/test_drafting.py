@@ -202,6 +202,16 @@ def test_swapped_columns_are_told_and_the_answer_is_taken(tmp_path, record, open
     assert one["k_i"].value == pytest.approx(two["k_i"].value, rel=1e-6)
 
 
+def test_a_unit_of_time_with_which_no_bearing_has_such_sizes_is_asked_about(tmp_path, record):
+    path = tmp_path / "s.csv"
+    head = "time [ms],voltage [V],current [A],position [m]"
+    np.savetxt(path, np.column_stack([record.t, record.u, record.i, record.x]), delimiter=",", header=head, comments="")
+    with pytest.raises(AmbidError, match=r"typical if time is a thousand times too small .* Say what is right: layout"):
+        draft(path)
+    assert draft(path, layout={"time_unit": "s"}).record.rate_hz == pytest.approx(record.rate)
+    assert draft(path, layout={"time_unit": "ms"}).record.rate_hz == pytest.approx(1e3 * record.rate)
+
+
 def test_a_position_that_never_changes_is_told_to_make_a_coil(tmp_path, record):
     table(tmp_path / "held.csv", record, (record.u, record.i, np.full_like(record.x, 1e-4)))
     made = draft(tmp_path / "held.csv")

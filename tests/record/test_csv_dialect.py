@@ -183,7 +183,9 @@ def test_a_temperature_called_t_is_not_the_time_where_another_column_is(tmp_path
     [
         ("Sample rate (kHz): 10", 10_000.0), ("Sampling rate: 10 000 Hz", 10_000.0), ("Rate: 10\u202f000 Hz", 10_000.0),
         ("Abtastrate: 10'000 Hz", 10_000.0), ("Sample rate: 20 kS/s", 20_000.0), ("Sample rate: 20000 Sa/s", 20_000.0),
-        ("fs = 20kHz", 20_000.0), ("Sample rate: 20k", None), ("Abtastrate: 10.000 Hz", None), ("Rate: 10", None),
+        ("# Sample rate (kHz) = 10", 10_000.0), ("# sampled at 10 kHz", 10_000.0), ("# dt [ms]: 0.1", 10_000.0),
+        ("# fs: 10", None), ("fs = 20kHz", 20_000.0), ("Sample rate: 20k", None), ("Rate: 10", None),
+        ("Abtastrate: 10.000 Hz", None),
     ],
 )  # fmt: skip
 def test_a_rate_above_the_table_is_read_or_asked_for(tmp_path, line, rate):
@@ -201,6 +203,7 @@ def test_a_rate_above_the_table_is_read_or_asked_for(tmp_path, line, rate):
     [
         "12/31/2025 1:{:02d}:{:05.2f} PM", "31.12.2025 13:{:02d}:{:05.2f}", "31/12/25 13:{:02d}:{:05.2f}",
         "31-12-2025 13:{:02d}:{:05.2f}", "2025/12/31 13:{:02d}:{:05.2f}", "2025-12-31T13:{:02d}:{:05.2f}Z",
+        "0 days 00:{:02d}:{:05.2f}",
     ],
 )  # fmt: skip
 def test_dates_of_any_country_are_time(stamp):
@@ -214,3 +217,73 @@ def test_midnight_changes_the_day_and_nothing_else_does():
     for texts in (["31.12.2025 13:00:00", "2.1.2026 13:00:01"], ["31.12.2025 13:00:00", "31.12.2025 1:00:00 PM"],
                   ["31.12.2025 25:00:00", "31.12.2025 25:00:01"], ["1.2.3"], ["31.12.2025 13:00:00", "x"]):  # fmt: skip
         assert dates(texts) is None
+
+
+INSTRUMENTS = {
+    "a delimiter behind every row": text([BEHIND]).replace("\n", ",\n").replace("(mm),", "(mm)"),
+    "full-width brackets": text([["time（s）", "voltage（V）", "position（㎜）"]]),
+    "brackets, parentheses and units behind": text([["time_s", "voltage (Volts)", "position [mm]"]]),
+    "a unit that is no place": text([["time (s)", "voltage (V)", "position (mm)", "temperature (℃)"]],
+                                    columns=(TIME, VOLTAGE, POSITION, TIME)),
+    "units behind a key": text(['"Model","X7"', '"Vertical Units","V","mm"', NAMES]),
+    "names and units behind keys": text(
+        ['"TraceName","voltage","position"', '"VUnit","V","mm"', '"SampleRate",1000,1000', '"Time","14:03"', ""],
+        columns=(VOLTAGE, POSITION)),
+    "units by column in LabVIEW, one without": text(
+        ["***End_of_Header***", "Y_Unit_Label\tV\t\tmm", "***End_of_Header***", "X_Value\tvoltage\tplain\tposition"],
+        mark="\t", columns=(TIME, VOLTAGE, TIME, POSITION)),
+    "time stamps in numbers": text([["timestamp", "voltage [V]", "position [mm]"]]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", INSTRUMENTS)
+def test_what_instruments_write_is_read(tmp_path, case):
+    (tmp_path / "a.csv").write_text(INSTRUMENTS[case], encoding="utf-8")
+    record = read_record(tmp_path / "a.csv")
+    assert record.rate_hz == pytest.approx(1000.0)
+    kinds = {c.name: c.unit for c in record.channels if c.name not in ("temperature", "plain")}
+    assert kinds == {"voltage": "V", "position": "m"}
+    np.testing.assert_array_equal(record["position"].values, POSITION / 1000)
+
+
+def test_names_that_differ_in_units_alone_are_numbered_and_places_in_an_array_are_names(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(text([["time", "signal", "signal"], UNITS]))
+    assert [(c.name, c.unit) for c in read_record(path).channels] == [("signal", "V"), ("signal 2", "m")]
+    path.write_text(text([["time [s]", "Y[0]", "Y[1]"]]))
+    assert [(c.name, c.unit) for c in read_record(path).channels] == [("Y[0]", "?"), ("Y[1]", "?")]
+    path.write_text(text([["time", "signal", "signal"], ["s", "V", "V"]]))
+    with pytest.raises(RecordError, match="'signal' occurs twice"):
+        read_record(path)
+
+
+def test_notes_beside_a_table_end_and_a_channel_that_stops_does_not(tmp_path):
+    path, rows = tmp_path / "a.csv", [f"{k / 1000},{k % 5},{k % 3}" for k in range(200)]
+    path.write_text("\n".join(["time [s],u [V],i [A],mean", rows[0] + ",3.5", *(x + "," for x in rows[1:])]) + "\n")
+    record = read_record(path)
+    assert record.names == ("u", "i")
+    assert record.history[0].settings["left_out"] == ["mean"]
+    stopped = [x + f",{k % 7}" * (k < 150) + "," * (k >= 150) for k, x in enumerate(rows)]
+    path.write_text("\n".join(["time [s],u [V],i [A],x [m]", *stopped]) + "\n")
+    with pytest.raises(RecordError, match=r"row 152, column 'x': the value is missing"):
+        read_record(path)
+
+
+def test_cells_that_name_themselves_are_columns(tmp_path):
+    path, rows = tmp_path / "serial.txt", [f"us:{500 * k + 7},u:{k % 5}.5,x_mm:-{k % 3}e-1" for k in range(20)]
+    for mark in (",", "\t", " "):
+        path.write_text("Ready\n" + "\n".join(x.replace(",", mark) for x in rows) + "\n")
+        record = read_record(path)
+        assert (record.names, record.rate_hz) == (("u", "x_mm"), 2000.0)
+        np.testing.assert_array_equal(record["x_mm"], [-0.1 * (k % 3) for k in range(20)])
+    path.write_text("\n".join([*rows, "us:10007,u:"]))
+    with pytest.raises(RecordError, match=r"row 21: its cells are not us:…, u:…, x_mm:…"):
+        read_record(path)
+    path.write_text("fs: 2000, gain: 3\n" + text([HEAD]))
+    assert read_record(path).names == ("voltage", "position")
+
+
+def test_a_date_beside_numbers_is_no_number_with_a_space_in_it(tmp_path):
+    path, stamps = tmp_path / "a.csv", [f"3/5/2024 2:03:{k:02d} PM" for k in range(20)]
+    path.write_text(text([["stamp", "u [V]", "i [A]"]], form=str, columns=(stamps, range(20), range(20))))
+    assert dict(read_record(path).history[0].settings).keys() == {"format", "rows", "left_out", "time"}

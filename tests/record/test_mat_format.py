@@ -126,3 +126,55 @@ def test_without_a_mapping_every_vector_is_a_channel_of_unknown_unit(tmp_path):
 def test_a_mapping_is_for_mat_files_only(tmp_path):
     with pytest.raises(RecordError, match=r"for \.mat files"):
         read_record(tmp_path / "r.csv", variables={"voltage": ("u", "V")})
+
+
+def octave(name, x, kind="matrix"):
+    """A variable as Octave's ``save`` writes it where no format is told."""
+    x = np.atleast_2d(x)
+    head = f"# name: {name}\n# type: {kind}\n"
+    rows = "".join("".join(f" {v:.17g}" for v in row) + "\n" for row in x)
+    return (
+        head
+        + (f"{x[0, 0]:.17g}\n" if kind == "scalar" else f"# rows: {len(x)}\n# columns: {x.shape[1]}\n{rows}")
+        + "\n\n"
+    )
+
+
+def test_a_text_of_octave_is_read_with_its_structs_and_ranges(tmp_path):
+    path = tmp_path / "a.mat"
+    title = "# name: title\n# type: string\n# elements: 1\n# length: 7\nbench 1\n\n\n"
+    odd = "# name: ready\n# type: bool\n1\n\n\n"
+    clock = f"# name: t\n# type: double_range\n# base, limit, increment\n0 {(N - 1) * 1e-3} 0.001\n\n\n"
+    fields = clock + octave("u", VOLTAGE[:, None]) + octave("y", BOTH)
+    struct = f"# name: run\n# type: scalar struct\n# ndims: 2\n 1 1\n# length: 3\n{fields}\n\n"
+    path.write_text("# Created by Octave 9.2.0, Fri Mar 01 10:00:00 2024 UTC <a@b>\n" + title + odd + struct)
+    record = read_record(path, variables={"voltage": ("run.u", "V"), "x": ("run.y(:,2)", "mm"), "time": ("run.t", "s")})
+    np.testing.assert_array_equal(record["voltage"], VOLTAGE)
+    np.testing.assert_array_equal(record["x"], BOTH[:, 1] / 1000)
+    assert record.rate_hz == pytest.approx(1000.0)
+    columns = octave("u", VOLTAGE[:, None]) + octave("i", BOTH[:, :1])
+    path.write_text("# Created by Octave 9.2.0\n" + columns + octave("fs", 2000.0, "scalar"))
+    assert (read_record(path).names, read_record(path).rate_hz) == (("u", "i"), 2000.0)
+    path.write_text("# Created by Octave 9.2.0\n" + columns[:-200])
+    with pytest.raises(RecordError, match="no sound text of Octave"):
+        read_record(path)
+
+
+def test_a_matrix_of_outputs_stands_beside_the_vector_of_the_input(tmp_path):
+    path = tmp_path / "a.mat"
+    savemat(path, {"u": VOLTAGE, "y": BOTH, "OutputName": np.array(["pos", "cur"], object), "Ts": 1e-3})
+    assert read_record(path).names == ("pos", "cur", "u")
+    variables = {name: (name, unit) for name, unit in (("u", "V"), ("pos", "mm"), ("cur", "A"))}
+    assert read_record(path, variables=variables).names == ("pos", "cur", "u")
+
+
+def test_rates_in_attributes_of_hdf5_are_read(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        group = file.create_group("run")
+        group["u"], group["i"] = VOLTAGE, BOTH[:, 0]
+        group["u"].attrs["units"] = "mV"
+        group.attrs.update({"operator": "a", "sample_rate": 5000.0, "gains": [1.0, 2.0]})
+    record = read_record(path)
+    assert record.rate_hz == 5000.0
+    np.testing.assert_array_equal(record["u"], VOLTAGE / 1000)

@@ -19,7 +19,7 @@ from ambid.job.data import RigSource, known_rig
 from ambid.physics.linear_model import LinearModel, model
 from ambid.record import NAMED, GapPolicy, Record, Source, format_of, read_record
 from ambid.record.record import Channel
-from ambid.record.words import label_of, quantities, unit_or_none, unit_within
+from ambid.record.words import label_of, quantities, symbol, unit_or_none, unit_within
 from ambid.rig import read_bench
 from ambid.rig.draft import axes_of, draft_rig, model_of
 from ambid.rig.roles import ROLES, Candidate, at_rest, bearing_of, close, rank_roles, swapped, unit_of
@@ -90,7 +90,8 @@ def draft(
         raise RecordError(
             f"{setting('column', f'{wrong}={told[wrong][0]}')}: there is no role {wrong!r}; there are {what}"
         )
-    record, variables = _read(source, told, rate_hz, gaps, dict(layout or {}))
+    layout = dict(layout or {})
+    record, variables = _read(source, told, rate_hz, gaps, layout)
     told = {role: (role, unit) for role, (_, unit) in told.items()} if variables else told
     strange = next((x for x in record.names if _CONTROL & set(x) or len(x) > _LONGEST_NAME), None)
     if strange is not None:
@@ -102,7 +103,8 @@ def draft(
     reading |= {"gaps": gaps} if gaps != "error" else {}
     if len(axes_of(record)) > 1 and not told:
         return Draft(text=draft_rig(record, reading=reading), record=record, guess=None)
-    found = guess(record, told, coil=coil, first=first, choose=choose, trial=True)
+    found = guess(record, told, coil=coil, first=first, choose=choose, trial=True,
+                  timed=rate_hz is not None or "time_unit" in layout)  # fmt: skip
     if found.question:
         raise RecordError(found.question)
     text = draft_rig(
@@ -115,8 +117,11 @@ def draft(
 def guess(
     record: Record, told: Mapping[str, tuple[str, str | None]] | None = None, *, coil: bool = False, first: bool = True,
     choose: Callable[[str, Sequence[Candidate]], Sequence[Candidate]] | None = None, trial: bool = False,
+    timed: bool = False,
 ) -> Guess:  # fmt: skip
-    """Tell what the columns of a record are; `trial`: hold units that the record says against the sizes of bearings."""
+    """Tell what the columns of a record are; `trial`: hold units that the record says against the sizes of bearings;
+    `timed`: that of time, or a rate, was told.
+    """
     told = {role: x for role, x in (told or {}).items() if role in ROLES}
     ranked = rank_roles(record, {role: name for role, (name, _) in told.items()})
     roles = [role for role in ROLES if not (coil and role == "position")]
@@ -147,11 +152,11 @@ def guess(
             f"current {i!r} and position {x!r} look swapped: {x!r} is what the voltage drives through a coil, and it "
             f"moves {i!r}. Say which: {other}, in their units, or confirm it with {setting('column', f'current={i}')}"
         )
-    units = {role: unit for role, (_, unit) in told.items() if unit}
+    units = {role: symbol(unit) for role, (_, unit) in told.items() if unit}
     why = dict.fromkeys(units, "as told")
     if not question:
         plant = model(model_of(ranked, coil=coil))
-        question = _unit_question(record, ranked, plant, units, why, trial=trial)
+        question = _unit_question(record, ranked, plant, units, why, trial=trial, timed=timed)
     settings: Mapping[str, Any] = record.history[0].settings if record.history else {}
     return Guess(ranked=ranked, units=units, why=why, question=question, time=str(settings.get("time", "")))
 
@@ -247,14 +252,14 @@ def _listed(record: Record) -> str:
 
 def _unit_question(
     record: Record, ranked: Mapping[str, Sequence[Candidate]], plant: LinearModel, units: dict[str, str],
-    why: dict[str, str], *, trial: bool,
+    why: dict[str, str], *, trial: bool, timed: bool,
 ) -> str:  # fmt: skip
     """Add the units of columns without one, by their names or by the sizes of a bearing; return what cannot be told."""
     chosen = {role: ranked[role][0].channel for role in (*plant.inputs, *plant.outputs)}
     for role, c in chosen.items():
         within = unit_within(c.name) if c.unit != unit_of(c) else None
         if within and role not in units:
-            units[role], why[role] = within, "its name ends in it"
+            units[role], why[role] = symbol(within), "its name ends in it"
     strange = next((r for r, c in chosen.items() if c.unit == UNKNOWN != c.source_unit and r not in units), None)
     if strange is not None:
         c = chosen[strange]
@@ -281,7 +286,7 @@ def _unit_question(
     found = _trial(record, columns, plant) if shown else None  # where it would take long to fail
     if bare:
         return _of_sizes(found, bare, chosen, units, why)
-    return "" if found is None else _contradiction(found, chosen, units)
+    return "" if found is None else _contradiction(found, chosen, units, timed=timed)
 
 
 def _in_si(c: Channel, unit: str | None) -> Channel:
@@ -330,11 +335,14 @@ def _of_sizes(
     return f"column {name!r} has no unit, and {may}. Say which: {setting('column', f'{role}={name} [{ROLES[role]}]')}"
 
 
-def _contradiction(found: _Trial, chosen: Mapping[str, Channel], units: Mapping[str, str]) -> str:
+def _contradiction(found: _Trial, chosen: Mapping[str, Channel], units: Mapping[str, str], *, timed: bool) -> str:
     """Return the question about a unit with which no bearing has these sizes; nothing where all are usual."""
     check = found.check({})
     slips = {key.removesuffix("_factor"): x for key, x in check.values.items() if key.endswith("_factor")}
     for role, factor in slips.items():
+        if role == "time" and len(slips) == 1 and not timed:
+            told = " or ".join((setting("layout", "time_unit=UNIT"), setting("rate_hz")))
+            return f"{check.detail.partition('. Correct')[0]}. Say what is right: {told}"
         if role not in chosen or role in units:
             continue
         said = unit_or_none(chosen[role].source_unit)

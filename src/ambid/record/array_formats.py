@@ -84,9 +84,11 @@ def read_xlsx(
     if word is not None and word not in sheets:
         raise RecordError(f"record {path} has no sheet {word!r}; it has {choices(word, sheets)} Correct layout sheet")
     name = word or max(sheets, key=lambda x: len(sheets[x]))
-    lines = [line.rstrip("\t") for line in sheets[name]]
-    while lines and not lines[-1]:
+    lines = sheets[name]
+    while lines and not lines[-1].strip():
         lines.pop()
+    empty = min((len(x) - len(x.rstrip("\t")) for x in lines), default=0)  # columns that no row fills
+    lines = [x[: len(x) - empty] for x in lines]
     told = {"sheet": name}
     provenance = dict(provenance_of(path, data))
     table, rate = table_of_lines([*lines, ""], path, gaps, layout, rate_hz, provenance, told)

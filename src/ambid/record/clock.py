@@ -23,9 +23,9 @@ _EVEN = 0.05  # part of an interval by which those of a column differ that is ti
 _LOOKED = 4096  # rows
 _DAY = 86_400.0  # s
 _STAMP = re.compile(
-    r"(\d{1,4}/\d{1,2}/\d{1,4}|\d{1,2}\.\d{1,2}\.\d{2,4}|\d{1,2}-\d{1,2}-\d{2,4})[T ,]{1,2}"
-    r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d+)?) ?([AaPp][Mm])?"
-)
+    r"^[ \t]*(\d{1,4}/\d{1,2}/\d{1,4}|\d{1,2}\.\d{1,2}\.\d{2,4}|\d{1,2}-\d{1,2}-\d{2,4}|\d+ days?)[T ,]{1,2}"
+    r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d+)?) ?([AaPp][Mm])?[ \t]*$", re.MULTILINE,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +78,7 @@ def clock_of(
         return Clock(rate_hz=told[0][1], why=f"{told[0][0]} beside the data: {told[0][1]:g} Hz")
     if at is None and rate_hz is None:
         nameless = [j for j in rising if units[j] is None and even(columns[j]) and not _counts(columns[j])]
-        nameless = [j for j in nameless if names[j].lower() == "x" or not quantities(names[j])]
+        nameless = [j for j in nameless if names[j].lower() in ("x", *_UNITS) or not quantities(names[j])]
         if len(nameless) == 1:
             at, why = nameless[0], "it alone rises evenly"
     return Clock(column=at, why="" if at is None else f"{names[at]!r}, because {why}")
@@ -108,13 +108,13 @@ def seconds(
 
 
 def dates(texts: Sequence[str]) -> Array | None:
-    """Return dates or times of day in s from the first on; None where the texts are none.
+    """Return dates, times of day or times since the start in s from the first on; None where the texts are none.
 
     Of a date that is not ISO 8601 only that it changes counts: at midnight, where the time of day falls.
     """
     day = "1970-01-01T" if re.fullmatch(r"\d{1,2}:\d\d:\d\d([.,]\d+)?", texts[0]) else ""
     if not day and not re.match(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:", texts[0]):
-        return _dates_of_a_country(texts)
+        return _stamps(texts)
     try:
         stamps = np.array([day + x.replace(" ", "T").replace(",", ".").rstrip("Z") for x in texts], "datetime64[ns]")
     except ValueError:
@@ -122,19 +122,19 @@ def dates(texts: Sequence[str]) -> Array | None:
     return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
-def _dates_of_a_country(texts: Sequence[str]) -> Array | None:
-    """Return stamps such as ``12/31/2025 1:02:03 PM`` and ``31.12.2025 13:02:03,5`` as `dates` does."""
-    rows = [_STAMP.fullmatch(x.strip()) for x in texts] if _STAMP.fullmatch(texts[0].strip()) else [None]
-    found = [m.groups("") for m in rows if m is not None]
-    if len(found) < len(rows) or len({half == "" for *_, half in found}) > 1:
+def _stamps(texts: Sequence[str]) -> Array | None:
+    """Return ``12/31/2025 1:02:03 PM``, ``31.12.2025 13:02:03,5`` and ``0 days 00:02:03.5`` as `dates` does."""
+    found = _STAMP.findall("\n".join(texts)) if _STAMP.fullmatch(texts[0]) else []
+    if len(found) != len(texts):
         return None
-    noon = [int(hour) if half == "" else int(hour) % 12 + 12 * (half.lower() == "pm") for _, hour, _, _, half in found]
-    of_day = np.array([
-        3600.0 * h + 60.0 * int(minute) + float(second.replace(",", "."))
-        for h, (_, _, minute, second, _) in zip(noon, found, strict=True)
-    ])  # fmt: skip
-    falls = np.diff(of_day) < -_DAY / 2.0
-    if of_day.max() >= _DAY or falls.tolist() != [a[0] != b[0] for a, b in pairwise(found)]:
+    days, hours, minutes, seconds, halves = zip(*found, strict=True)
+    half = np.char.lower(np.array(halves))
+    hour = np.array(hours).astype(np.float64)
+    hour = hour if half[0] == "" else hour % 12.0 + 12.0 * (half == "pm")
+    minute, second = np.array(minutes).astype(np.float64), np.char.replace(np.array(seconds), ",", ".")
+    of_day = 3600.0 * hour + 60.0 * minute + second.astype(np.float64)
+    falls, changes = np.diff(of_day) < -_DAY / 2.0, np.array([a != b for a, b in pairwise(days)], dtype=bool)
+    if np.any((half == "") != (half[0] == "")) or of_day.max() >= _DAY or not np.array_equal(falls, changes):
         return None
     return np.asarray(np.round(of_day - of_day[0] + _DAY * np.concatenate([[0.0], np.cumsum(falls)]), 9))
 

@@ -8,13 +8,12 @@ import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from ambid.errors import RecordError
 from ambid.record.record import utf8_text
-from ambid.record.words import is_time, label_of, quantities, rate_of, unit_or_none
+from ambid.record.words import label_of, quantities, rate_of, unit_or_none
 from ambid.settings.caller import setting
 
 _WORDS = {
@@ -25,12 +24,19 @@ _WORDS = {
     "encoding": {x: x for x in ("cp932", "gb18030", "utf-8", "utf-16", "utf-16-le", "utf-16-be", "latin-1", "cp1252")},
 }
 _MARKS = str.maketrans("\u2019\u00a0\u202f", "'  ")
+_WIDE = str.maketrans("（）［］", "()[]")
 _POWER = r"(?:[eE][+-]?\d+)?"
 _DECIMAL = re.compile(rf"[+-]?(?:[1-9]\d{{0,2}}(?:[.' ]\d{{3}})+|\d*),\d*{_POWER}")
 _THOUSANDS = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:,\d{{3}})+(?:\.\d*)?{_POWER}")
 _NUMBER = re.compile(rf"[+-]?(?:\d{{1,3}}(?:[.,' ]\d{{3}})+|\d*)(?:[.,]\d*)?{_POWER}")
 _PARENTHESES = re.compile(r"(?P<name>.*\S)\s*\((?P<unit>[^()]*)\)")
-_NO_OTHER = re.compile(r"(?:deg ?|°|º)?[CFK]|m?bar|counts?|lsb|digits?|-|a\.?u\.?", re.IGNORECASE)  # units, not places
+_NO_OTHER = re.compile(
+    r"(?:deg ?|°|º)?[CFK]|[℃℉]|N\.?m|m?bar|counts?|lsb|digits?|-|a\.?u\.?", re.IGNORECASE
+)  # units, not places
+_KEYS = {
+    "units": re.compile(r"y_unit_label|[vy]?_?units?|vertical_units?|einheit(?:en)?"),
+    "names": re.compile(r"(?:trace|channel|signal|kanal)_?names?|label|names?"),
+}
 _SPACED = re.compile("\\d([' \u00a0\u202f\u2019])\\d")
 _NAMED_NUMBER = re.compile(
     rf"(?P<name>[^\W\d][^,;:=\t]*?)\s*[=:,;\t ]\s*(?P<number>\d{{1,3}}(?:[ '\u00a0\u2009\u202f]\d{{3}})+|"
@@ -39,6 +45,7 @@ _NAMED_NUMBER = re.compile(
 _HEAD = 1 << 14  # bytes in which the words of an encoding are looked for
 _FASTEST = 2e6  # Hz, of a bearing
 _MOST_COLUMNS = 4096
+_NOTED = 64  # rows of a table within which notes beside it end
 _FEW = 8  # rows of numbers below a header, without which a text is no table
 
 
@@ -116,42 +123,48 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
     if begin is None or block is None:
         return None
     refuse_width(len(block.kinds), block.at + 1, path)
+    block = _without_notes(lines, block)
     heads = _heads(lines, block, path, words.get("units"))
     if heads is None:
         return None
     at, delimiter, settings = block.at, block.delimiter, dict(heads.settings)
     if block.blank:
         lines, delimiter = [*lines[:at], *("\t".join(x.split()) for x in lines[at:])], "\t"
-    body, marks = _plain_numbers(lines, at, delimiter, path, words)
-    if block.blank:
-        marks["delimiter"] = " "
-    settings |= marks
-    if heads.row is not None and heads.row != begin and not lines[begin].startswith("%"):
-        settings["preamble"] = sum(bool(x.strip()) and not x.startswith("#") for x in lines[begin : heads.row])
-    if any(x.startswith("%") for x in lines[:at]):
-        settings["comments"] = "%"
-    names, units, texts = list(heads.names), None if heads.units is None else list(heads.units), {}
+    above, names, units = lines[:at], list(heads.names), None if heads.units is None else list(heads.units)
+    texts: dict[str, Sequence[str]] = {}
     if any(kind != "number" for kind in block.kinds):
-        rows = [_cells(line, delimiter) for line in body[at:] if line.strip()]
+        rows = [_cells(line, delimiter) for line in lines[at:] if line.strip()]
         ragged = next((k for k, row in enumerate(rows) if len(row) != len(block.kinds)), None)
         if ragged is not None:
             raise RecordError(
                 f"{path}, row {at + 1 + ragged}: {len(rows[ragged])} cells instead of {len(block.kinds)}. Correct the "
                 "row, or remove it if it was cut off"
             )
-        columns = dict(enumerate(zip(*rows, strict=True)))
+        columns = list(zip(*rows, strict=True))
         keep = [j for j, kind in enumerate(block.kinds) if kind == "number" or (kind == "empty" and any(columns[j]))]
         texts = {names[j]: columns[j] for j, kind in enumerate(block.kinds) if kind == "text"}
-        body = [*body[:at], *(delimiter.join(row[j] for j in keep) for row in rows)]
+        kept = [[f'"{x}"' if delimiter in x else x for x in columns[j]] for j in keep]
+        lines = [*above, *map(delimiter.join, zip(*kept, strict=True))]
         names, units = [names[j] for j in keep], None if units is None else [units[j] for j in keep]
-        settings |= {"left_out": list(texts)} if texts else {"empty": len(block.kinds) - len(keep)}
-    elif not (settings or words):
+    body, marks = _plain_numbers(lines, at, delimiter, path, words)
+    if block.blank:
+        marks["delimiter"] = " "
+    settings |= marks
+    if heads.row is not None and heads.row != begin and not above[begin].startswith("%"):
+        settings["preamble"] = sum(bool(x.strip()) and not x.startswith("#") for x in above[begin : heads.row])
+    if any(x.startswith("%") for x in above):
+        settings["comments"] = "%"
+    if texts:
+        settings["left_out"] = list(texts)
+    elif len(names) < len(block.kinds):
+        settings["empty"] = len(block.kinds) - len(names)
+    if not (settings or words):
         return None
     used = {heads.row, *heads.below}
-    comments = [x.lstrip("#%").strip() for k, x in enumerate(lines[:at]) if x.strip() and k not in used]
+    comments = [x.lstrip("#%").strip() for k, x in enumerate(above) if x.strip() and k not in used]
     return Dialect(
         row=at, delimiter=delimiter, cells=tuple(names), units=None if units is None else tuple(units), texts=texts,
-        comments=tuple(comments), lines=body, settings=settings, beside={**_beside(lines[:at]), **heads.beside},
+        comments=tuple(comments), lines=body, settings=settings, beside=heads.beside,
     )  # fmt: skip
 
 
@@ -196,6 +209,19 @@ def _first_block(lines: Sequence[str], word: str | None) -> _Block | None:
     return None
 
 
+def _without_notes(lines: Sequence[str], block: _Block) -> _Block:
+    """Take columns of numbers that end long before the others, as notes beside a table do, for texts."""
+    if block.blank or len(lines) < block.at + 2 * _NOTED:
+        return block
+    later = [_cells(x, block.delimiter) for x in (lines[block.at + _NOTED], next(filter(str.strip, reversed(lines))))]
+    if all(later[0]) or any(len(x) != len(block.kinds) for x in later):
+        return block
+    rows = [_cells(x, block.delimiter) for x in lines[block.at + _NOTED :]]
+    noted = [j for j, x in enumerate(later[0]) if not (x or any(len(row) > j and row[j] for row in rows))]
+    kinds = tuple("text" if j in noted and x == "number" else x for j, x in enumerate(block.kinds))
+    return replace(block, kinds=kinds)
+
+
 def _split(line: str, delimiter: str) -> list[str]:
     """Take a row of numbers apart; blanks separate where nothing else does."""
     if delimiter != " ":
@@ -230,10 +256,13 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
         line = lines[k].lstrip("#%").strip(" ") if lines[k].startswith(("#", "%")) else lines[k]
         if line.strip():
             cells = _head_cells(line, block, n)
-            if cells is None:
+            if cells is None or (rows and _KEYS["units"].fullmatch(_key(cells[0]))):
                 break
             rows.insert(0, (k, cells))
         k -= 1
+    keyed, beside = _keyed(lines[: block.at], block)
+    if "names" in keyed and (not rows or all(keyed["names"])):
+        rows = [(int(keyed["at"][0]), keyed["names"])]
     above = next((x for x in reversed(lines[: block.at]) if x.strip() and not x.startswith(("#", "%"))), "")
     cells = _cells(above, block.delimiter if not block.blank else "\t")
     if sum(map(_is_number, cells)) > 1 and not any(lines[j] is above for j, _ in rows):
@@ -242,7 +271,6 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
         return None
     if word == "row" and len(rows) < 2:
         raise RecordError(f"{path}, row {block.at}: no names stand above these units. Correct the layout")
-    lvm = _labview(lines[: block.at], rows[-1][1]) if rows else None
     units_at = _units_row([c for _, c in rows], word)
     if units_at is None and word is None and len(rows) > 1 and rows[-1][1] != rows[-2][1]:
         if not lines[rows[-2][0]].startswith(("#", "%")):
@@ -252,7 +280,6 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
             )
         rows = rows[-1:]
     names_at = len(rows) - 1 if units_at is None else units_at - 1
-    beside: dict[str, tuple[float, str | None]] = {}
     settings: dict[str, object] = {}
     units: list[str | None] | None = None
     if units_at is not None:
@@ -265,23 +292,20 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
     else:
         row, names = rows[names_at]
         if units_at is not None:  # numbers among the units belong to the names above them
-            beside = {
+            beside |= {
                 a: (float(b), None) for a, b in zip(names, rows[units_at][1], strict=True) if a and _plain_float(b)
             }
         elif (parsed := _in_parentheses(names, row, path, word)) is not None:
             names, units = parsed
             settings["units"] = "parentheses"
-        elif word is None and all(names) and any(label_of(x)[1] for x in names) and not any("[" in x for x in names):
+        elif word is None and all(names) and any(label_of(x)[1] for x in names if "[" not in x):
             names, units = map(list, zip(*map(label_of, names), strict=True))
             settings["units"] = "behind"
-    if lvm is not None:
-        units, beside = [*lvm[0], *[None] * n][:n] if units is None else units, {**beside, **lvm[1]}
+    if "units" in keyed and units is None:
+        units = [u or ("s" if x.startswith("X_Value") else None) for x, u in zip(names, keyed["units"], strict=True)]
+        settings["units"] = "row"
     counted = [x or f"column {j + 1}" for j, x in enumerate(names)]
-    doubled = [x for j, x in enumerate(counted) if x in counted[:j] and is_time(x)]
-    for x in doubled:  # every column of LabVIEW may have its own time
-        for m, j in enumerate([j for j, y in enumerate(counted) if y == x][1:], 2):
-            counted[j] = f"{x} {m}"
-    if doubled or "" in names:
+    if "" in names:
         settings["header"] = "incomplete"
     elif row is not None and lines[row].startswith(("#", "%")):
         settings["header"] = "comment"
@@ -293,12 +317,14 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
 
 def _head_cells(line: str, block: _Block, n: int) -> list[str] | None:
     """Take a row above the numbers apart; None where it is none of `n` names or units."""
+    line = line.translate(_WIDE)
     if block.blank or block.delimiter == "\t":
         ways = [line.split("\t"), re.split(r"\t|\s{2,}", line.strip()), re.split(r"\s+(?![\[(])", line.strip())]
         cells = next(([x.strip() for x in way] for way in ways if len(way) in (n, n + 1)), [])
     else:
         cells = _cells(line, block.delimiter)
     cells = cells[:n] if len(cells) == n + 1 and cells[n].lower() == "comment" else cells
+    cells += [""] * (len(cells) == n - 1 and block.kinds[-1] == "empty")  # a delimiter ends the rows of numbers alone
     texts = [x for x, kind in zip(cells, block.kinds, strict=False) if kind == "number"]
     if len(cells) != n or not any(texts) or (any(map(_is_number, texts)) and not _numbered(texts)):
         return None
@@ -328,22 +354,36 @@ def _units_row(rows: Sequence[Sequence[str]], word: str | None) -> int | None:
     return None
 
 
-def _labview(lines: Sequence[str], names: Sequence[str]) -> tuple[list[str | None], dict[str, Any]] | None:
-    """Return units and interval of the head of a LabVIEW measurement file, units in the order of its names."""
-    marks = {x.split("\t")[0].strip(): x.split("\t")[1:] for x in lines if "\t" in x}
-    if not any("End_of_Header" in x for x in lines):
-        return None
-    texts = iter([x.strip() for x in marks.get("Y_Unit_Label", []) if x.strip()])
-    units = ["s" if x.startswith("X_Value") else next(texts, None) for x in names]
-    interval = marks.get("Delta_X", [""])[0].strip().replace(",", ".")
-    return units, {"Delta_X": (float(interval), "s")} if _plain_float(interval) else {}
+def _key(text: str) -> str:
+    return text.strip('"').replace(" ", "_").lower()
 
 
-def _beside(lines: Sequence[str]) -> dict[str, tuple[float, str | None]]:
-    """Return the numbers that the lines above the table name, with their units."""
+def _keyed(lines: Sequence[str], block: _Block) -> tuple[dict[str, list[str]], dict[str, tuple[float, str | None]]]:
+    """Return names and units of columns that stand behind a key, as instruments write them, and the numbers that are
+    the same for every column; in a measurement of LabVIEW the interval is in s.
+    """
+    found, beside, n = dict[str, list[str]](), dict[str, tuple[float, str | None]](), len(block.kinds)
+    labview = any("End_of_Header" in x for x in lines)
+    for k, line in enumerate(lines):
+        key, *cells = [x.strip('"') for x in _cells(line, "\t" if block.blank else block.delimiter)]
+        while len(cells) > n or (len(cells) == n and not cells[-1] and block.kinds[0] != "empty"):
+            cells.pop()
+        cells = ["", *cells] if len(cells) == n - 1 else cells
+        if len(cells) != n or not any(cells):
+            continue
+        if kind := next((kind for kind, form in _KEYS.items() if form.fullmatch(_key(key))), ""):
+            found |= {kind: cells, "at": [str(k)]} if kind == "names" else {kind: cells}
+        values = {x.replace(",", ".") for x in cells if x}
+        if len(values) == 1 and _plain_float(text := values.pop()):
+            beside[key] = (float(text), "s" if labview and key == "Delta_X" else None)
+    return found, beside
+
+
+def named_numbers(comments: Sequence[str]) -> dict[str, tuple[float, str | None]]:
+    """Return the numbers that the lines above a table name, with their units."""
     pairs: dict[str, tuple[float, str | None]] = {}
-    for line in lines:
-        match = _NAMED_NUMBER.fullmatch(line.lstrip("#%").strip().rstrip(",;\t "))
+    for line in comments:
+        match = _NAMED_NUMBER.fullmatch(line.rstrip(",;\t "))
         if match and not _thousandfold(**match.groupdict()):
             number = re.sub(r"[\s']", "", match["number"]).replace(",", ".")
             pairs[match["name"].strip()] = (float(number), match["unit"] or None)

@@ -18,7 +18,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record.clock import TIME_NAMES, Clock, clock_of, dates, rises, seconds, unit_words
-from ambid.record.csv_dialect import decoded, recognised, refuse_width
+from ambid.record.csv_dialect import decoded, named_numbers, recognised, refuse_width
 from ambid.record.record import Record, file_bytes, gunzipped, readable, sha256_of
 from ambid.record.sampling import (
     MIN_SAMPLES,
@@ -29,7 +29,7 @@ from ambid.record.sampling import (
     record_of_rows,
     uniform_record,
 )
-from ambid.record.words import label_of
+from ambid.record.words import is_time, label_of
 from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 
@@ -85,18 +85,17 @@ def table_of_lines(
     provenance: dict[str, str], told: Mapping[str, object],
 ) -> tuple[Table, float | None]:  # fmt: skip
     """Read a text, line by line; `told`: what its reading has told so far, for the history."""
-    lines = _upright(lines)
+    lines = _labelled(_upright(lines), path)
     dialect = recognised(lines, path, layout)
     beside: Mapping[str, tuple[float, str | None]] = {}
     texts: Mapping[str, Sequence[str]] = {}
     if dialect is None:
         header = find_header(lines, path)
     else:
-        names, units = _names_and_units(dialect.cells, dialect.row, path)
+        names, units = _names_and_units(dialect.cells, dialect.row, path, dialect.units)
         header = Header(
-            row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments,
-            unit_texts=units if dialect.units is None else tuple(map(_either, dialect.units, units)),
-        )  # fmt: skip
+            row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments, unit_texts=units
+        )
         lines, told, beside, texts = dialect.lines, {**dialect.settings, **told}, dialect.beside, dialect.texts
     values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
     if (long := pivoted(header.names, header.unit_texts, values, texts)) is not None:
@@ -118,8 +117,22 @@ def _upright(lines: list[str]) -> list[str]:
     return [(mark or ",").join(row) for row in zip(*cells, strict=True)]
 
 
-def _either(below: str | None, behind: str | None) -> str | None:
-    return behind if below is None else below
+def _labelled(lines: list[str], path: Path) -> list[str]:
+    """Return a text whose cells name themselves, ``u:1.2,i:0.3`` as sketches print for a plotter, with a header row."""
+    begin = next((k for k, x in enumerate(lines[:_FEW_CHANNELS]) if _SELF_NAMED.fullmatch(x)), len(lines))
+    if not all(map(_SELF_NAMED.fullmatch, lines[begin : begin + MIN_SAMPLES])) or begin + MIN_SAMPLES > len(lines):
+        return lines
+    found = [[*_PAIR.finditer(x)] if _SELF_NAMED.fullmatch(x) else [] for x in lines[begin:]]
+    while found and not lines[begin + len(found) - 1].strip():
+        found.pop()
+    names = [x["name"] for x in found[0]]
+    for k, pairs in enumerate(found, begin + 1):
+        if [x["name"] for x in pairs] != names:
+            raise RecordError(
+                f"{path}, row {k}: its cells are not {', '.join(f'{x}:…' for x in names)}, as those of row {begin + 1} "
+                "are. Correct the row, or remove it if it was cut off"
+            )
+    return [*lines[:begin], ",".join(names), *(",".join(x["number"] for x in pairs) for pairs in found)]
 
 
 def table_of(
@@ -133,6 +146,7 @@ def table_of(
         provenance["comment"] = "\n".join(comments)
     layout, place = told.get("layout"), f"{path}, row {header.row}"
     layout = layout if isinstance(layout, Mapping) else {}
+    beside = {**named_numbers(header.comments), **beside}
     names, units = header.names, header.unit_texts
     clock = clock_of(names, units, list(values.T), where=str(path), rate_hz=rate_hz, beside=beside, layout=layout)
     settings: dict[str, object] = {"format": "csv", "rows": values.shape[0]}
@@ -245,6 +259,9 @@ def head_lines(record: Record) -> list[str]:
 
 
 _HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
+_NAMED, _NUMBER = r"[^\W\d][^:=,;\t]*?", r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PAIR = re.compile(rf"(?P<name>{_NAMED})\s*[:=]\s*(?P<number>{_NUMBER})")
+_SELF_NAMED = re.compile(rf"\s*(?:{_NAMED}\s*[:=]\s*{_NUMBER}(?:[\s,;]+|$)){{2,}}")
 _BLOCK = 20_000  # rows that are read at once
 _FEW_CHANNELS = 64  # lines of which each may be a channel
 _LONG = 1 << 23  # bytes from which compiled reading saves more than loading it takes
@@ -288,21 +305,30 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
     return Header(row=row, delimiter=delimiter, names=names, unit_texts=units, comments=tuple(comments))
 
 
-def _names_and_units(cells: Sequence[str], row: int, path: Path) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
-    """Take the cells of a header row apart."""
+def _names_and_units(
+    cells: Sequence[str], row: int, path: Path, below: Sequence[str | None] | None = None
+) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
+    """Take the cells of a header row apart; `below`: units that another row gives. Names that occur again are numbered
+    where they are of time, or differ in the units of that row.
+    """
     refuse_width(len(cells), row, path)
     names, units = list[str](), list[str | None]()
-    for j, cell in enumerate(cells, start=1):
-        match = _HEADER_CELL.fullmatch(cell)
-        name = match["name"].strip() if match else cell
+    labels = [_HEADER_CELL.fullmatch(cell) for cell in cells]
+    numbered = any(x and x["unit"].isdigit() and x["unit"] != "1" for x in labels)  # Y[0], Y[1]: places in an array
+    for j, (cell, match) in enumerate(zip(cells, labels, strict=True)):
+        match = None if numbered and match and match["unit"].isdigit() else match
+        name, unit = (match["name"].strip(), match["unit"].strip()) if match else (cell, None)
+        unit = below[j] if below is not None and below[j] is not None else unit
         if not name:
             raise RecordError(
-                f"{path}, row {row}: column {j} has no name. Write 'name [unit]', or remove the delimiter"
+                f"{path}, row {row}: column {j + 1} has no name. Write 'name [unit]', or remove the delimiter"
             )
         if name in names:
-            raise RecordError(f"{path}, row {row}: column {name!r} occurs twice; names must differ. Rename one")
+            if not is_time(name) and (below is None or unit == units[names.index(name)]):
+                raise RecordError(f"{path}, row {row}: column {name!r} occurs twice; names must differ. Rename one")
+            name = next(x for k in range(2, len(cells) + 2) if (x := f"{name} {k}") not in names)
         names.append(name)
-        units.append(match["unit"].strip() if match else None)
+        units.append(unit)
     return tuple(names), tuple(units)
 
 

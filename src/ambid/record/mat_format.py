@@ -5,11 +5,12 @@ variables as MATLAB does, ``i``, ``data.i``, ``y(:,2)``, and their units; `mat_s
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import re
 import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ from ambid.record.hdf5_format import hdf5_of
 from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, scalars, structures
 from ambid.record.record import Record, file_bytes, provenance_of
 from ambid.record.sampling import GapPolicy, Table, check_gap_policy, refuse_gaps, uniform_record
-from ambid.record.streams import refuse_claim
-from ambid.record.words import is_time
+from ambid.record.streams import one_line, refuse_claim
+from ambid.record.words import is_time, rate_of
 from ambid.units import UNKNOWN
 
 # bytes of numbers by type
@@ -124,8 +125,8 @@ def read_mat(
     gaps: GapPolicy = "error",
     layout: Mapping[str, str] | None = None,
 ) -> Record:
-    """Read a record, SI where units are known, from a ``.mat`` file of version 5 or 7.3; `rate_hz`: for one without
-    time.
+    """Read a record, SI where units are known, from a ``.mat`` file of version 5 or 7.3, or a text of Octave;
+    `rate_hz`: for one without time.
     """
     path = Path(path)
     check_gap_policy(gaps)
@@ -141,9 +142,9 @@ def read_content(
     variables: Mapping[str, tuple[str, str]] | None, rate_hz: float | None, gaps: GapPolicy, layout: Mapping[str, str],
 ) -> Record:  # fmt: skip
     """Make a record of variables: structs are mappings, arrays of them and cells are lists."""
-    listed = [
-        x for name, (x, _) in (variables or {}).items() if name != "time" and (x != name or _is_vector(content.get(x)))
-    ]
+    wanted = {name: x for name, (x, _) in (variables or {}).items() if name != "time"}
+    listed = [x for name, x in wanted.items() if x != name or _is_vector(content.get(x))]
+    listed = listed if len(listed) == len(wanted) else []  # some are no variables: columns of a matrix, with names
     groups: Mapping[str, Any] = {}
     if not listed or not any(is_time(x) for x in (*content, *(variables or {}))):
         refuse_foreign(content, path)
@@ -210,6 +211,9 @@ def _content(path: Path, data: bytes) -> dict[str, Any]:
     """Return the variables of the file, structs as nested dicts."""
     if b"\x89HDF\r\n\x1a\n" in (data[:8], data[512:520]):
         return content_of_hdf5(path, matlab=True)
+    if data.startswith(b"# Created by Octave"):
+        with one_line(path, "no sound text of Octave", "Save it again, as save -v7"):
+            return dict(_octave(iter(data.decode().split("\n"))))
     from scipy.io import loadmat
 
     try:
@@ -246,6 +250,37 @@ def _fields(value: Any) -> Any:
     return value
 
 
+def _octave(lines: Iterator[str], most: float = math.inf) -> Iterator[tuple[str, Any]]:
+    """Yield the variables of a text that Octave saves where no format is told, structs as nested dicts."""
+
+    def numbers(count: int) -> Array:
+        return np.array(" ".join(next(lines) for _ in range(count)).split(), dtype=np.float64)
+
+    def sizes(count: int) -> list[int]:
+        said = (re.match(r"# (?:rows|columns|length|elements): (\d+)", x) for x in lines)
+        return [int(found[1]) for found in itertools.islice(filter(None, said), count)]
+
+    while most > 0 and (line := next((x for x in lines if x.startswith("# name: ")), "")):
+        most, kind = most - 1, next(lines).removeprefix("# type: ").removeprefix("float ")
+        value: Any = Foreign(kind)
+        if kind == "scalar":
+            value = numbers(1).reshape(1, 1)
+        elif kind == "matrix":
+            rows, columns = sizes(2)
+            value = numbers(rows).reshape(rows, columns)
+        elif kind.endswith("range"):
+            base, limit, step = (next(lines), numbers(1))[1][:3]
+            value = base + step * np.arange(1 + np.floor((limit - base) / step + 1e-9))[None, :]
+        elif kind == "string":
+            value = [(next(lines), next(lines))[1] for _ in range(sizes(1)[0])]
+            value = value[0] if len(value) == 1 else value
+        elif kind == "cell":
+            value = [x for _, x in _octave(lines, math.prod(sizes(2)))]
+        elif kind.endswith("struct"):
+            value = dict(_octave(lines, sizes(1)[0]))
+        yield line.removeprefix("# name: "), value
+
+
 def content_of_hdf5(path: Path, *, matlab: bool) -> dict[str, Any]:
     """Return the variables of a file of version 7.3, or of the datasets and groups of any HDF5 file."""
     import h5py
@@ -268,6 +303,11 @@ def content_of_hdf5(path: Path, *, matlab: bool) -> dict[str, Any]:
             ]
             units = {n: text_of(x, k) for n, x in node.items() for k in ("units", "unit") if k in x.attrs}
             fields |= {"units": units} if units and "units" not in fields else {}
+            said: dict[str, set[float]] = {}
+            for key, x in [] if matlab else [y for part in (node, *node.values()) for y in part.attrs.items()]:
+                if isinstance(x, np.number | float | int) and rate_of(key, float(x)):
+                    said.setdefault(key, set()).add(float(x))
+            fields |= {k: np.full((1, 1), min(x)) for k, x in said.items() if len(x) == 1 and k not in fields}
             if arrays and all(arrays) and len({len(x) for x in fields.values()}) == 1:  # an array of structs
                 return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
             return fields

@@ -81,6 +81,7 @@ def structures(content: Mapping[str, Any], path: Path) -> dict[str, list[_Signal
     vectors = {k: v for k, x in content.items() if (v := _vector(x)) is not None}
     if not groups and len(vectors) < 2:
         signals = list(_matrix(content))
+        signals += [_Signal(name=k, values=v, units={}) for k, v in vectors.items() if signals]
         return {_VECTORS: signals} if signals else {}
     time = next((v for k, v in vectors.items() if is_time(k)), None)
     if time is not None:  # of models that save it apart
@@ -393,7 +394,7 @@ def _text(value: Any) -> str:
     """Return a text, or nothing."""
     while isinstance(value, list) and len(value) == 1:
         value = value[0]
-    return value.strip() if isinstance(value, str) else ""
+    return " ".join(value.split()) if isinstance(value, str) else ""  # names of blocks are written on two lines
 
 
 def _vector(value: Any, least: int = 2) -> Array | None:

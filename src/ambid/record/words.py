@@ -18,7 +18,8 @@ _QUANTITIES: Mapping[str, tuple[str, str, str]] = {
     "time": ("zeitstempel|timestamp|messzeit|horodatage|時間|时间|時刻|时刻",
              "time|times|zeit|temps|tiempo|tempo|tout|uhrzeit|clock", "t"),
     "voltage": ("volt|spannung|tension|duty|pwm|stellgro|電圧|电压|電壓", "command|input|drive", "u|v"),
-    "current": ("curr|strom|courant|corriente|corrente|intensi|(?<![sd])amp(?!l)|電流|电流", "amp", "i"),
+    "current": (r"curr|strom|courant|corriente|corrente|intensi|(?<!st)(?<!cl)(?<!\br)(?<![sd])amp(?!l)|電流|电流",
+                "amp", "i"),
     "position": (r"pos|disp|gap|eddy|hall|abstand|auslenk|luftspalt|weg\b|deplac|entrefer|desplaz|entrehierro|spostam|"
                  "traferro|sensor|変位|位置|位移|間隙|间隙|气隙|ギャップ", "lage|output|hub", "x|y|z"),
     "speed": ("speed|velo|omega|rotat|drehzahl|geschwind|vitesse|giri|速度|转速|回転", "rpm|spin", "n"),
@@ -27,7 +28,7 @@ _QUANTITIES: Mapping[str, tuple[str, str, str]] = {
     "other": ("temper|温度|counter|index|sample|status|druck|pressure|accel|beschleun", "temp|nr|no|flag", ""),
 }  # fmt: skip
 _SET_POINT = re.compile(
-    r"ref|set(?!up)|target|desired|goal|soll|consign|riferim|objetivo|目標|目标|指令|参考|参照|設定|设定|給定|给定"
+    r"(?<!ent)ref(?!lec)|set(?!up)|target|desired|goal|soll|consign|riferim|objetivo|目標|目标|指令|参考|参照|設定|设定|給定|给定"
 )
 _PART = {k: re.compile(parts) for k, (parts, _, _) in _QUANTITIES.items()}
 _WORD = {k: frozenset(words.split("|")) for k, (_, words, _) in _QUANTITIES.items()}
@@ -35,7 +36,7 @@ _SHORT = {
     k: re.compile(f"(?:{short})(?:[a-z0-9]|ist|act|in|out)?") for k, (_, _, short) in _QUANTITIES.items() if short
 }
 _RATE = re.compile(
-    r"fs|sr|f_?s|rate|(?:sampl\w*|abtast\w*|scan\w*|acquisition|daq)(?:rate|freq\w*)|fsampl\w*|frequence\w*echant\w*|"
+    r"fs|sr|f_?s|rate|(?:sampl|record|acquir|logg|measur)edat|(?:sampl\w*|abtast\w*|scan\w*|acquisition|daq)(?:rate|freq\w*)|fsampl\w*|frequence\w*echant\w*|"
     r"frecuencia\w*muestreo|frequenzadi?campion\w*|采样[频率]+|サンプリング周波数|samplespersecond|ratehz"
 )
 _INTERVAL = re.compile(
@@ -44,11 +45,11 @@ _INTERVAL = re.compile(
     r"サンプリング周期|wfincrement|horinterval"
 )
 _UNIT_WORDS = {
-    "V": "volt volts", "A": "amp amps ampere amperes", "m": "meter meters metre metres", "s": "sec secs second seconds "
-    "sekunde sekunden", "ms": "millisecond milliseconds msec", "us": "microsecond microseconds usec", "N": "newton "
-    "newtons", "Hz": "hertz s/s sa/s sps samples/s", "kHz": "ks/s ksa/s ksps", "ohm": "ohms", "deg": "degree degrees °",
-    "rad": "radian radians", "rpm": "1/min u/min min^-1", "mm": "millimeter millimeters", "um": "micron microns "
-    "micrometer micrometers", "mV": "millivolt", "mA": "milliampere milliamps",
+    "V": "volt volts vdc", "A": "amp amps ampere amperes", "m": "meter meters metre metres", "s": "sec secs second "
+    "seconds sekunde sekunden", "ms": "millisecond milliseconds msec", "us": "microsecond microseconds usec",
+    "N": "newton newtons", "Hz": "hertz s/s sa/s sps samples/s", "kHz": "ks/s ksa/s ksps", "ohm": "ohms",
+    "deg": "degree degrees °", "rad": "radian radians", "rpm": "1/min u/min min^-1", "mm": "millimeter millimeters",
+    "um": "micron microns micrometer micrometers", "mil": "mils thou", "mV": "millivolt", "mA": "milliampere milliamps",
 }  # fmt: skip
 _SYMBOLS = {word: unit for unit, words in _UNIT_WORDS.items() for word in words.split()}
 _LABEL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
@@ -118,7 +119,11 @@ def is_set_point(name: str) -> bool:
 
 
 def unit_within(name: str) -> str | None:
-    """Return the unit that a name ends in, as ``pos_um`` and ``time_ms`` do, where it is one of what the rest names."""
+    """Return the unit that a name ends in, as ``pos_um`` and ``time_ms`` do, where it is one of what the rest names;
+    ``ms``, ``us`` and ``ns`` alone are units too.
+    """
+    if name.lower() in ("ms", "us", "ns"):
+        return name.lower()
     rest, _, last = name.strip().replace(" ", "_").rpartition("_")
     unit = unit_or_none(last) if rest and not last.isdigit() else None
     return last if unit is not None and any(_KINDS.get(k) == unit.si for k in quantities(rest)) else None
