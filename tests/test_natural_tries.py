@@ -131,6 +131,14 @@ WORKS: dict[str, Callable[[Cell], Any]] = {
         ambid.identify(c.record, 'parameters.m = {value = 100, unit = "g", role = "fixed"}')["m"].value
         == pytest.approx(0.1)
     ),
+    "init(table)": lambda c: (
+        ambid.identify(
+            {"u": c.voltage, "i": c.record["current"], "x": c.record["position"]},
+            ambid.init({"u": c.voltage, "i": c.record["current"], "x": c.record["position"]}, rate_hz=1e4),
+        )["k_i"].value
+        == pytest.approx(c.estimate["k_i"].value, rel=1e-6)
+    ),
+    "init(csv)": lambda c: 'column = "voltage"' in ambid.init(c.csv),
     "info(rig=text)": lambda c: ambid.info(c.looped, c.text).channels,
     "fit(rig=dict)": lambda c: (
         ambid.fit(c.looped, "n4sid", orders="n=3", rig=tomllib.loads(c.text)).inputs == ("voltage",)
@@ -176,6 +184,10 @@ WORKS: dict[str, Callable[[Cell], Any]] = {
     "plot in a notebook": lambda c: c.estimate.plot()._repr_png_()[:4] == b"\x89PNG",
     # identify, and what an estimate gives
     "identify(DataFrame)": lambda c: ambid.identify(c.frame)["k_i"].value == pytest.approx(c.estimate["k_i"].value),
+    "round(estimate[...], 3)": lambda c: round(c.estimate["R"], 3) == round(c.estimate["R"].value, 3),
+    "fit(record, structure, [2, 2, 1])": lambda c: (
+        ambid.fit(c.record, "arx", [2, 2, 1], input="voltage", output="current").orders["na"] == 2
+    ),
     "float(parameter)": lambda c: float(c.estimate["k_i"]) == c.estimate["k_i"].value,
     "arithmetic of parameters": lambda c: (
         c.estimate["k_i"] / c.estimate["m"] == c.estimate["k_i"].value / c.estimate["m"].value
@@ -274,6 +286,19 @@ SAYS: dict[str, tuple[Callable[[Cell], Any], str]] = {
         lambda c: ambid.fit(c.looped, "arx", input="u", output="i", rig=c.rig),
         "^(?!.*--)input.*omit input",
     ),
+    "names that are none of the roles": (
+        lambda c: ambid.identify({"u [V]": c.voltage, "i [A]": c.voltage}, rate_hz=1e4),
+        "Let ambid.init draft a rig",
+    ),
+    "columns as arguments": (lambda c: ambid.identify(voltage=c.voltage, rate_hz=1e4), r"a dict as record"),
+    "fix=": (lambda c: ambid.identify(c.record, fix={"R": 4.0}), "'role': 'fixed'"),
+    "model=": (lambda c: ambid.identify(c.record, model="coil"), r"rig=\{'model'"),
+    "na=": (lambda c: ambid.fit(c.record, "arx", na=2, nb=2), "orders='na=2"),
+    "two records": (lambda c: ambid.compare(c.record, c.second), "ambid.identify returns of each"),
+    "estimate.cov": (lambda c: c.estimate.cov, "Write covariance"),
+    "estimate.transfer_function": (lambda c: c.estimate.transfer_function, "to_control"),
+    "record.copy()": (lambda c: c.record.copy(), "to_dataframe"),
+    "ambid.version": (lambda c: ambid.version, "__version__"),
     "a file that is not there": (lambda c: ambid.load("nothing.csv"), "nothing.csv"),
     "a rig that is not there": (lambda c: ambid.identify(c.record, "nothing.toml"), "nothing.toml"),
     "a rig with a slip": (lambda c: ambid.identify(c.record, {"parameter": {}}), "Did you mean 'parameters'"),

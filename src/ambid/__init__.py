@@ -1,8 +1,8 @@
 """Physical parameters of active magnetic bearings, with honest uncertainty.
 
 ``ambid.identify(record, rig)`` is the main job; `fit`, `frf`, `compare`, `margins`, `accept`, `simulate`, `track`,
-`validate`, `info` and `acquire` are the functions that the commands of these names call, and `load` reads what they
-wrote. Rooms and names are imported when they are first used, so that ``import ambid`` costs next to nothing.
+`validate`, `info`, `init` and `acquire` are the functions that the commands of these names call, and `load` reads what
+they wrote. Rooms and names are imported when they are first used, so that ``import ambid`` costs next to nothing.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ambid.job import identify as identify
     from ambid.job import identify_nonlinear as identify_nonlinear
     from ambid.job import info as info
+    from ambid.job import init as init
     from ambid.job import load as load
     from ambid.job import margins as margins
     from ambid.job import simulate as simulate

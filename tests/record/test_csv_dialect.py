@@ -232,6 +232,7 @@ INSTRUMENTS = {
     "units by column in LabVIEW, one without": text(
         ["***End_of_Header***", "Y_Unit_Label\tV\t\tmm", "***End_of_Header***", "X_Value\tvoltage\tplain\tposition"],
         mark="\t", columns=(TIME, VOLTAGE, TIME, POSITION)),
+    "a header in a comment": text(["# time[s] voltage[V] position[mm]"], mark=" "),
     "time stamps in numbers": text([["timestamp", "voltage [V]", "position [mm]"]]),
 }  # fmt: skip
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ambid.job.data import read_data as read_data
     from ambid.job.data import signals_of as signals_of
     from ambid.job.drafting import info as info
+    from ambid.job.drafting import init as init
     from ambid.job.experiment_design import design_experiment as design_experiment
     from ambid.job.fits import compare as compare
     from ambid.job.fits import fit as fit

@@ -114,6 +114,47 @@ def draft(
     return Draft(text=text, record=record, guess=found)
 
 
+@of_job("init")
+def init(
+    record: Source, *, column: Mapping[str, str] | None = None, coil: bool = False, yes: bool = False,
+    rate_hz: float | None = None, gaps: GapPolicy = "error", layout: Mapping[str, str] | None = None,
+) -> str:  # fmt: skip
+    """Guess a rig file of a record: which columns are voltage, current and position, and in which units.
+
+    Parameters
+    ----------
+    record : file, Record, DataFrame, Dataset or dict of arrays
+    column : Mapping of str to str, optional
+        Column or path of a variable by role, its unit behind it: ``{"position": "gap [mm]"}``.
+    coil : bool, optional
+        Draft the coil alone, without a position.
+    yes : bool, optional
+        Of columns that are as likely take the first, without a question.
+    rate_hz, gaps, layout : optional
+        As `ambid.identify`.
+
+    Returns
+    -------
+    str
+        TOML text with a comment on each guess, which `ambid.identify` and the others take as their rig.
+
+    Raises
+    ------
+    AmbidError
+        With the one question that the record leaves open.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> rec = ambid.simulate("thesis", duration=0.1, seed=1)
+    >>> table = {"u": rec["voltage"], "i": rec["current"], "x": rec["position"]}
+    >>> rig = ambid.init(table, rate_hz=rec.rate_hz)
+    >>> ambid.identify(table, rig, rate_hz=rec.rate_hz).verdict.word
+    'usable'
+    """
+    return draft(record, columns=column, coil=coil, first=yes, rate_hz=rate_hz, gaps=gaps, layout=layout).text
+
+
 def guess(
     record: Record, told: Mapping[str, tuple[str, str | None]] | None = None, *, coil: bool = False, first: bool = True,
     choose: Callable[[str, Sequence[Candidate]], Sequence[Candidate]] | None = None, trial: bool = False,

@@ -42,11 +42,11 @@ _SEARCH = 0.95  # of a nonlinear job's time, by experience; the rest are the che
 def fit(
     records: Source | Sequence[Source],
     structure: str,
+    orders: Orders | Settings | Sequence[int] | int | str | None = "auto",
     *,
     input: Names | None = None,  # noqa: A002 - the words of the command
     output: Names | None = None,
     reference: Names | None = None,
-    orders: Orders | Settings | Sequence[int] | int | str | None = "auto",
     settings: object = None,
     seed: int | None = None,
     criterion: str = "bic",
@@ -345,6 +345,8 @@ def compare(
     ------
     AmbidError
         If the record, its channels or the orders break a rule.
+    EstimationError
+        If two records are given.
 
     Examples
     --------
@@ -356,6 +358,11 @@ def compare(
     from ambid.validation.comparison import compare as compare_fits
 
     results = _results(record, candidates)
+    if isinstance(candidates, Record):
+        raise EstimationError(
+            "two records are given; records are compared by their estimates. Give ambid.compare(one, other) what "
+            "ambid.identify returns of each"
+        )
     if results is not None:
         from ambid.validation.agreement import agreement
 

@@ -150,7 +150,7 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
     if block.blank:
         marks["delimiter"] = " "
     settings |= marks
-    if heads.row is not None and heads.row != begin and not above[begin].startswith("%"):
+    if heads.row is not None and begin < heads.row and not above[begin].startswith("%"):
         settings["preamble"] = sum(bool(x.strip()) and not x.startswith("#") for x in above[begin : heads.row])
     if any(x.startswith("%") for x in above):
         settings["comments"] = "%"

@@ -31,7 +31,7 @@ from ambid.rig.rig import (
     role_units,
 )
 from ambid.rig.rotor import modes_of, operation_of, planes_of, rotor_of, shaft_of, si_of, speed_of, turning_of, unit_of
-from ambid.settings.caller import path_of
+from ambid.settings.caller import command, path_of
 from ambid.units import UNKNOWN, parse_unit
 
 if TYPE_CHECKING:
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     )
 
 
-_FIRST = "Let 'ambid init' draft a rig of the record"
-_DRAFTED = " in the rig that 'ambid init' drafts"
 SELECTED = Step(name="select")
 """Says in the history of a record that its channels are named by role and calibrated."""
 
@@ -622,7 +620,9 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
         return _through_a_rig(record, rig, wanted)
     for c in rig.channels:
         if c.column not in record.names:
-            remedy = f"Correct channels.{c.role}.column" if rig.source is not None else _FIRST
+            remedy = (
+                f"Correct channels.{c.role}.column" if rig.source is not None else f"Let {command('init')} draft a rig"
+            )
             raise RecordError(
                 f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
                 f" {choices(c.column, record.names)} {remedy}"
@@ -691,9 +691,10 @@ def _in_declared_unit(channel: Channel, c: RigChannel, *, drafting: bool = False
     if channel.unit == UNKNOWN:
         unknown = channel.source_unit != UNKNOWN
         what = f"is in [{channel.source_unit}], an unknown unit" if unknown else "has no unit"
+        drafted = f" in the rig that {command('init')} drafts" if drafting else ""
         raise UnitError(
             f"column {channel.name!r} {what} (needed by channels.{c.role}). Write '{channel.name} [unit]' in the header"
-            f" ([1] for a plain number), or give channels.{c.role}.unit{_DRAFTED if drafting else ''}"
+            f" ([1] for a plain number), or give channels.{c.role}.unit{drafted}"
         )
     return channel
 

@@ -17,6 +17,11 @@ R = TypeVar("R")
 _AFTER = {
     "json": "result.save(file)", "plot": "result.plot()", "report": "result.report(file)", "out": "result.save(file)",
     "export": "result.export(file)", "strict": "result.passed", "nonlinear": "ambid.identify_nonlinear",
+    "model": "rig={'model': NAME}", "T": "duration=",
+    **dict.fromkeys(("voltage", "current", "position", "u", "i", "x"), "a dict as record: {'voltage [V]': u, ...}"),
+    **dict.fromkeys(("na", "nb", "nc", "nd", "nf", "nk", "order"), "orders='na=2,nb=2,nk=1'"),
+    **dict.fromkeys(("fix", "fixed", "known", "initial", "start"),
+                    "rig={'parameters': {'R': {'value': 4.2, 'unit': 'ohm', 'role': 'fixed'}}}"),
 }  # fmt: skip
 _NUMBERS = ("number", "positive", "from_zero", "share", "whole")
 

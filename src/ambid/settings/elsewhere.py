@@ -24,14 +24,18 @@ PACKAGE: Mapping[str, str] = {
     "lsim": "result.simulate(record)", "sim": "result.simulate(record)", "predict": "result.predict(record, ahead)",
     "goodnessOfFit": "result.fit", "fitperf": "result.fit", "save": "result.save(file)", "idinput": "ambid.excitation",
     "models": "ambid.model_names(), ambid.preset_names()", "export": "result.export(file)",
+    **dict.fromkeys(("draft", "guess", "make_rig"), "ambid.init(record)"), "version": "__version__",
+    **dict.fromkeys(("presets", "list_presets"), "ambid.preset_names()"), "help": "help(ambid.identify)",
 }  # fmt: skip
 """Of the package."""
 
 RECORD: Mapping[str, str] = {
     **dict.fromkeys(("fs", "rate", "SamplingRate"), "rate_hz"), **dict.fromkeys(("dt", "Ts"), "1 / rate_hz"),
     **dict.fromkeys(("time", "t", "SamplingInstants", "index"), "time_s"), "columns": "names",
-    **dict.fromkeys(("iloc", "loc", "head", "tail", "describe", "resample", "values", "corr"), "to_dataframe().{0}"),
+    **dict.fromkeys(("iloc", "loc", "head", "tail", "resample", "values", "corr"), "to_dataframe().{0}"),
     **dict.fromkeys(("to_csv", "to_hdf", "write"), "save(file)"), "fft": "plot()", "detrend": "ambid.signals",
+    **dict.fromkeys(("to_pandas", "copy", "rename", "drop", "describe", "info"), "to_dataframe()"),
+    **dict.fromkeys(("psd", "filter"), "ambid.signals"), "cut": "record[from_s:to_s]",
     **dict.fromkeys(("u", "InputData", "y", "OutputData"), "record['name']"),
 }  # fmt: skip
 """Of a record; a part of one is ``record[0.5:2.0]``, in seconds."""
@@ -39,12 +43,15 @@ RECORD: Mapping[str, str] = {
 RESULT: Mapping[str, str] = {
     **dict.fromkeys(("bode", "step", "impulse", "nyquist", "feedback", "damp", "tf", "ss", "zpk"), "to_control()"),
     **dict.fromkeys(("A", "B", "C"), "continuous.{0}, or to_control().{0}"), "D": "to_control().D",
-    **dict.fromkeys(("polynomials", "state_space", "transfer_function"), "to_dict()[{0!r}]"),
+    **dict.fromkeys(("state_space", "transfer_function", "to_ss", "to_tf"), "to_control()"),
     **dict.fromkeys(("G", "frequency_hz", "coherence"), "response.{0}"), "magnitude": "abs(response.G)",
-    **dict.fromkeys(("params", "getpvec", "Report", "x"), "parameters"), "getcov": "covariance", "resid": "residuals",
-    **dict.fromkeys(("aic", "bic", "fpe"), "criteria[{0!r}]"), "sd": "to_dataframe()['sd']", "ci95": "to_dataframe()",
+    **dict.fromkeys(("params", "getpvec", "Report", "x"), "parameters"), "resid": "residuals",
+    **dict.fromkeys(("getcov", "cov", "covariance_matrix"), "covariance"), "corr": "correlation",
+    **dict.fromkeys(("ok", "passed", "success"), "verdict.word"), "compare": "ambid.compare(one, other)",
+    **dict.fromkeys(("aic", "bic", "fpe"), "criteria[{0!r}]"), "ci95": "to_dataframe()",
+    **dict.fromkeys(("sd", "std", "stderr", "bse"), "to_dataframe()['sd']"), "polynomials": "to_dict()[{0!r}]",
     **dict.fromkeys(("json", "to_json", "to_csv", "write"), "save(file)"), "show": "plot()", "print": "summary()",
-    "r2": "fit", "score": "fit", "FitPercent": "fit", "rate_hz": "record['rate_hz']",
+    "r2": "fit", "score": "validate(record)", "FitPercent": "fit", "rate_hz": "record['rate_hz']",
 }  # fmt: skip
 """Of a result."""
 
