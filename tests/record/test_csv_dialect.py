@@ -232,6 +232,9 @@ INSTRUMENTS = {
     "units by column in LabVIEW, one without": text(
         ["***End_of_Header***", "Y_Unit_Label\tV\t\tmm", "***End_of_Header***", "X_Value\tvoltage\tplain\tposition"],
         mark="\t", columns=(TIME, VOLTAGE, TIME, POSITION)),
+    "rows of LabVIEW that begin with a tab": "\n".join(
+        ["Y_Unit_Label\tV\tmm\t", "Delta_X\t1e-3\t1e-3\t", "***End_of_Header***\t\t", "X_Value\tvoltage\tposition"]
+        + [f"\t{point(u)}\t{point(x)}" for u, x in zip(VOLTAGE, POSITION, strict=True)]),
     "a header in a comment": text(["# time[s] voltage[V] position[mm]"], mark=" "),
     "time stamps in numbers": text([["timestamp", "voltage [V]", "position [mm]"]]),
 }  # fmt: skip

@@ -90,7 +90,7 @@ def seconds(
 ) -> Array:  # fmt: skip
     """Return time stamps in s; `text`: their unit, as the column gives it; else name, steps or rate tell it."""
     text = (layout or {}).get("time_unit", text)
-    text = unit_within(name) if text is None else text
+    text = _unit_in(name) if text is None else text
     if text is None and rate_hz is not None and _counts(time):
         return time / rate_hz
     text = _unit_of_steps(time, name, where, rate_hz) if text is None else symbol(text)
@@ -139,11 +139,16 @@ def _stamps(texts: Sequence[str]) -> Array | None:
     return np.asarray(np.round(of_day - of_day[0] + _DAY * np.concatenate([[0.0], np.cumsum(falls)]), 9))
 
 
+def _unit_in(name: str) -> str | None:
+    """Return the unit in the name of a column that is time: ``time_ms``, or ``ms`` alone."""
+    return name.lower() if name.lower() in ("ms", "us", "ns") else unit_within(name)
+
+
 def unit_words(time: Array, name: str, text: str | None) -> str:
     """Say in which unit time is, and why, where the column does not say it."""
     if text is not None:
         return ""
-    within = unit_within(name)
+    within = _unit_in(name)
     if within:
         return f"in [{within}] by its name"
     return "".join(f"in [{unit}], in which its rate is a usual one" for unit in _plausible(time)[:1])

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ambid.errors import RecordError
 from ambid.record.record import utf8_text
-from ambid.record.words import label_of, quantities, rate_of, unit_or_none
+from ambid.record.words import is_time, label_of, quantities, rate_of, unit_or_none
 from ambid.settings.caller import setting
 
 _WORDS = {
@@ -256,7 +256,7 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
         line = lines[k].lstrip("#%").strip(" ") if lines[k].startswith(("#", "%")) else lines[k]
         if line.strip():
             cells = _head_cells(line, block, n)
-            if cells is None or (rows and _KEYS["units"].fullmatch(_key(cells[0]))):
+            if cells is None or "End_of_Header" in line or (rows and _KEYS["units"].fullmatch(_key(cells[0]))):
                 break
             rows.insert(0, (k, cells))
         k -= 1
@@ -301,7 +301,7 @@ def _heads(lines: Sequence[str], block: _Block, path: Path, word: str | None) ->
         elif word is None and all(names) and any(label_of(x)[1] for x in names if "[" not in x):
             names, units = map(list, zip(*map(label_of, names), strict=True))
             settings["units"] = "behind"
-    if "units" in keyed and units is None:
+    if "units" in keyed and units is None and (keyed["units"][0] or block.kinds[0] == "empty" or is_time(names[0])):
         units = [u or ("s" if x.startswith("X_Value") else None) for x, u in zip(names, keyed["units"], strict=True)]
         settings["units"] = "row"
     counted = [x or f"column {j + 1}" for j, x in enumerate(names)]
@@ -366,7 +366,7 @@ def _keyed(lines: Sequence[str], block: _Block) -> tuple[dict[str, list[str]], d
     labview = any("End_of_Header" in x for x in lines)
     for k, line in enumerate(lines):
         key, *cells = [x.strip('"') for x in _cells(line, "\t" if block.blank else block.delimiter)]
-        while len(cells) > n or (len(cells) == n and not cells[-1] and block.kinds[0] != "empty"):
+        while len(cells) >= n and not cells[-1]:
             cells.pop()
         cells = ["", *cells] if len(cells) == n - 1 else cells
         if len(cells) != n or not any(cells):

@@ -119,11 +119,7 @@ def is_set_point(name: str) -> bool:
 
 
 def unit_within(name: str) -> str | None:
-    """Return the unit that a name ends in, as ``pos_um`` and ``time_ms`` do, where it is one of what the rest names;
-    ``ms``, ``us`` and ``ns`` alone are units too.
-    """
-    if name.lower() in ("ms", "us", "ns"):
-        return name.lower()
+    """Return the unit that a name ends in, as ``pos_um`` and ``time_ms`` do, where it is one of what the rest names."""
     rest, _, last = name.strip().replace(" ", "_").rpartition("_")
     unit = unit_or_none(last) if rest and not last.isdigit() else None
     return last if unit is not None and any(_KINDS.get(k) == unit.si for k in quantities(rest)) else None
