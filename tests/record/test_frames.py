@@ -194,3 +194,10 @@ def test_reading_a_file_or_a_dict_imports_none_of_the_packages():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "Record of 9 samples, 9 s at 1 Hz: u [V] []"
+
+
+def test_a_unit_of_time_that_is_guessed_is_told():
+    table = {"time": 0.5 * np.arange(40), "u [V]": np.sin(np.arange(40))}
+    record = read_record(table)
+    assert record.rate_hz == pytest.approx(2000.0)
+    assert record.history[0].settings["time"] == "in [ms], in which its rate is a usual one"

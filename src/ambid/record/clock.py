@@ -84,12 +84,8 @@ def clock_of(
     return Clock(column=at, why="" if at is None else f"{names[at]!r}, because {why}")
 
 
-def seconds(
-    time: Array, name: str, text: str | None, where: str, layout: Mapping[str, str] | None = None,
-    rate_hz: float | None = None,
-) -> Array:  # fmt: skip
+def seconds(time: Array, name: str, text: str | None, where: str, rate_hz: float | None = None) -> Array:
     """Return time stamps in s; `text`: their unit, as the column gives it; else name, steps or rate tell it."""
-    text = (layout or {}).get("time_unit", text)
     text = _unit_in(name) if text is None else text
     if text is None and rate_hz is not None and _counts(time):
         return time / rate_hz
@@ -144,14 +140,18 @@ def _unit_in(name: str) -> str | None:
     return name.lower() if name.lower() in ("ms", "us", "ns") else unit_within(name)
 
 
-def unit_words(time: Array, name: str, text: str | None) -> str:
-    """Say in which unit time is, and why, where the column does not say it."""
-    if text is not None:
-        return ""
-    within = _unit_in(name)
-    if within:
-        return f"in [{within}] by its name"
-    return "".join(f"in [{unit}], in which its rate is a usual one" for unit in _plausible(time)[:1])
+def timed(
+    time: Array, name: str, text: str | None, why: str, where: str, layout: Mapping[str, str] | None = None,
+    rate_hz: float | None = None,
+) -> tuple[Array, dict[str, object]]:  # fmt: skip
+    """Return time stamps as `seconds`, and what is told of them: `why` they are, and their unit where none is said."""
+    found, text = "", (layout or {}).get("time_unit", text)
+    if text is None and rate_hz is None:
+        within = _unit_in(name)
+        usual = (f"in [{unit}], in which its rate is a usual one" for unit in _plausible(time))
+        found = f"in [{within}] by its name" if within else next(usual, "")
+    words = ", ".join(filter(None, [why, found]))
+    return seconds(time, name, text, where, rate_hz), {"time": words} if words else {}
 
 
 def _unit_of_steps(time: Array, name: str, where: str, rate_hz: float | None) -> str:

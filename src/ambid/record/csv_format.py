@@ -17,7 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.clock import TIME_NAMES, Clock, clock_of, dates, rises, seconds, unit_words
+from ambid.record.clock import TIME_NAMES, Clock, clock_of, dates, rises, timed
 from ambid.record.csv_dialect import decoded, named_numbers, recognised, refuse_width
 from ambid.record.record import Record, file_bytes, gunzipped, readable, sha256_of
 from ambid.record.sampling import (
@@ -154,9 +154,8 @@ def table_of(
     settings |= told
     if clock.column is not None:
         name, unit = names[clock.column], units[clock.column]
-        why = [clock.why, unit_words(values[:, clock.column], name, unit) if rate_hz is None else ""]
-        values[:, clock.column] = seconds(values[:, clock.column], name, unit, place, layout, rate_hz)
-        settings |= {"time": ", ".join(filter(None, why))} if any(why) else {}
+        values[:, clock.column], said = timed(values[:, clock.column], name, unit, clock.why, place, layout, rate_hz)
+        settings |= said
     elif clock.rate_hz is not None:
         settings["time"], rate_hz = clock.why, clock.rate_hz
     elif rate_hz is None and (stamps := next(((k, x) for k, t in texts.items() if (x := dates(t)) is not None), None)):

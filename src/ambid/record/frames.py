@@ -14,7 +14,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError, nearest
-from ambid.record.clock import TIME_NAMES, seconds
+from ambid.record.clock import TIME_NAMES, timed
 from ambid.record.record import Channel, Record
 from ambid.record.sampling import (
     GapPolicy,
@@ -191,7 +191,7 @@ def _table(parts: _Parts, units: Mapping[str, str] | None) -> Table:
     if units is not None and not isinstance(units, Mapping):
         raise RecordError(f"units is {units!r}; it holds a unit by column. Write units={{'voltage': 'V'}}")
     names, texts, arrays = list[str](), list[str | None](), list[Array]()
-    left, time = dict(units or {}), None
+    left, time, told = dict(units or {}), None, dict[str, object]()
     for column in parts.columns:
         name, text = _named(parts.what, column, left)
         if name in names:
@@ -223,11 +223,12 @@ def _table(parts: _Parts, units: Mapping[str, str] | None) -> Table:
         raise RecordError(f"columns differ in length ({listing}); all must have the same. Cut them")
     values = np.column_stack(arrays)
     if time is not None:
-        values[:, time] = seconds(values[:, time], names[time], texts[time], parts.what)
+        values[:, time], told = timed(values[:, time], names[time], texts[time], "", parts.what)
     digest = hashlib.sha256(repr((names, texts)).encode() + values.tobytes()).hexdigest()
     return Table(
         where=parts.what, names=tuple(names), unit_texts=tuple(texts), values=values, first_row=0, time=time,
-        provenance={"sha256": digest}, settings={"format": parts.what.removeprefix("the "), "rows": values.shape[0]},
+        provenance={"sha256": digest},
+        settings={"format": parts.what.removeprefix("the "), "rows": values.shape[0], **told},
     )  # fmt: skip
 
 

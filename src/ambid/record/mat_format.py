@@ -18,7 +18,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.clock import TIME_NAMES, clock_of, seconds, unit_words
+from ambid.record.clock import TIME_NAMES, clock_of, timed
 from ambid.record.hdf5_format import hdf5_of
 from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, scalars, structures
 from ambid.record.record import Record, file_bytes, provenance_of
@@ -165,9 +165,10 @@ def read_content(
     if time is not None:
         variable, unit = mapping["time"]
         text = None if unit == UNKNOWN else unit
-        words = unit_words(values[:, time], variable, text) if rate_hz is None else ""
-        told |= {"time": ", ".join(str(x) for x in (told.get("time"), words) if x)} if words else {}
-        values[:, time] = seconds(values[:, time], variable, text, f"record {path}", layout, rate_hz)
+        stamps, said = timed(
+            values[:, time], variable, text, str(told.get("time", "")), f"record {path}", layout, rate_hz
+        )
+        values[:, time], told = stamps, {**told, **said}
     table = Table(
         where=str(path), names=names, values=values, first_row=1, time=time,
         unit_texts=tuple(None if unit == UNKNOWN else unit for _, unit in mapping.values()),

@@ -11,7 +11,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
-from ambid.record.clock import TIME_NAMES, clock_of, seconds, unit_words
+from ambid.record.clock import TIME_NAMES, clock_of, timed
 from ambid.record.record import Record
 from ambid.record.sampling import MIN_SAMPLES, GapPolicy
 from ambid.record.streams import Stream, chosen_group, record_of
@@ -199,13 +199,11 @@ def _timed(
     names, units = [x.name for x in every], [next(filter(None, x.units.values()), None) for x in every]
     columns = [x.values for x in every]
     clock = clock_of(names, units, columns, where=f"record {path}", rate_hz=rate_hz, beside=beside, layout=layout)
-    told: dict[str, object] = {"time": clock.why} if clock.why else {}
     if clock.column is None:
+        told: dict[str, object] = {"time": clock.why} if clock.why else {}
         return every, told, rate_hz if clock.rate_hz is None else clock.rate_hz
-    own, name, unit = columns[clock.column], names[clock.column], units[clock.column]
-    words = unit_words(own, name, unit) if rate_hz is None else ""
-    time = seconds(np.asarray(own, dtype=np.float64), name, unit, f"record {path}", layout, rate_hz)
-    told = {"time": ", ".join(filter(None, [clock.why, words]))} if clock.why or words else {}
+    own = np.asarray(columns[clock.column], dtype=np.float64)
+    time, told = timed(own, names[clock.column], units[clock.column], clock.why, f"record {path}", layout, rate_hz)
     return [replace(x, time=time) for j, x in enumerate(every) if j != clock.column], told, rate_hz
 
 
