@@ -81,3 +81,10 @@ def test_a_rotor_that_is_held_makes_a_coil(name, rig_file):
     found = load_rig(rig_file(draft_rig(read_record(MAGLEV / f"coil_steps_{name}.csv"))))
     assert found.model == "coil"
     assert [c.column for c in found.channels] == ["duty_upper", "current_upper"]
+
+
+def test_the_voltage_of_a_sensor_stands_behind_that_of_the_coil(bench):
+    sensor = ("V", 1e4 * bench["position"][1])
+    coil, others = bench["voltage"], {k: bench[k] for k in ("current", "position")}
+    voltage = rank_roles(of(**{"sensor voltage": sensor, "coil voltage": coil, **others}))["voltage"]
+    assert [(c.channel.name, c.named) for c in voltage] == [("coil voltage", 1.0), ("sensor voltage", 0.9)]

@@ -146,7 +146,7 @@ def _name(c: Channel, role: str) -> float:
     if not names and c.unit == UNKNOWN and rises(c.values) and even(c.values):
         return 0.0  # it counts
     if unit == ROLES[role]:
-        return 1.0 if role in names else 0.8
+        return 1.0 if names == {role} else 0.9 if role in names else 0.8  # a sensor's voltage has two quantities
     if unit not in ("1", UNKNOWN, *(["V"] if role in names else [])):
         return 0.0
     return 0.6 if role in names else 0.0 if names else _UNNAMED
@@ -284,7 +284,7 @@ def _unit_words(c: Candidate) -> str:
     within = unit_within(c.channel.name) if c.channel.unit != unit_of(c.channel) else None
     words = f"its unit [{within or c.channel.source_unit}]"
     if unit_of(c.channel) == ROLES[c.role]:
-        return f"{words} and name fit" if c.named == 1.0 else f"{words} fits"
+        return f"{words} and name fit" if c.named >= 0.9 else f"{words} fits"
     return f"{words} instead of [{ROLES[c.role]}]" + ("" if c.named == _UNNAMED else ", but the name fits")
 
 
