@@ -22,7 +22,7 @@ from ambid.rotor.likelihood import Experiment
 from ambid.rotor.lines import Line, apart
 from ambid.rotor.scores import Cause, Score, agreement_checks, scored
 from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
-from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
+from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
 
@@ -75,6 +75,22 @@ def test_two_planes_wrong_together_are_no_single_plane(sound: Any) -> None:
     causes = named(sound[0], moved(sound[1], A__z_sensor=6e-3, B__z=6e-3), "fixed_agree")
     assert "planes" in causes
     assert not set(causes) & {"A.z", "B.z", "A.z_sensor", "B.z_sensor"}
+
+
+def test_coloured_noise_is_no_mode_and_leaves_numbers_usable(sound: Any) -> None:
+    record, rig = sound
+    rng, pole = np.random.default_rng(1), np.exp(-2 * np.pi * 10.0 / record.rate_hz)
+
+    def noisy(x: Any) -> Any:
+        slow = lfilter([1.0], [1.0, -pole], rng.standard_normal(x.size))
+        return x + 2e-6 * slow / slow.std()
+
+    found = ambid.identify(changed(record, ax_position=noisy, by_position=noisy), rig)
+    assert found.verdict.word == "usable", found.verdict.reasons
+    assert not found.modes
+    assert found.noise["ax_position"] > 2.0 * found.noise["ay_position"]
+    _, theta = model_of(replace(truth.BENCHES["rigid"], period=0.25))
+    assert not [p.name for p in found.parameters if p.sd and abs(p.value - theta[p.name]) > 3.8 * p.sd]
 
 
 def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:

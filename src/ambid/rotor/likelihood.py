@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.linear import directions, least_squares, triangle_of
@@ -23,6 +24,10 @@ _FAR = 50.0  # logarithms beyond which a number is no machine's
 _SETTLED = 1e-3  # squared length of a corrected step, in standard deviations, below which it is over
 _NOISE_STEPS = 40
 _NOISE_SETTLED = 1e-3
+_COLOURED, _CLIPPED = 6.0, 8.0  # score from which noise is coloured; power over its mean up to which a line counts
+_COLOURED_LINES, _POLES = 12, 10  # lines below the lowest pole of a low pass, and poles that are tried
+_MOST_COLOURS = 24
+_OWN_PART = 1e-3  # of the information of a coloured part, that others do not have
 _LEAST = 1e-14  # level of a source, over the mean power that it would explain alone
 _LINES_PER_UNKNOWN = 3
 
@@ -50,17 +55,25 @@ class Point:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Noise:
-    """Noise of one period's residuals, from between the excited lines: C(k) = Σ_j s_j g_j(k) g_j(k)ᴴ, g_j a sensor's
-    unit vector or the response to a held force or voltage, s_j by Fisher scoring (Pintelon and Schoukens 2012, ch. 10,
+    """Noise of one period's residuals, from between the excited lines: C(k) = Σ_j s_j(k) g_j(k) g_j(k)ᴴ, g_j a sensor's
+    unit vector or the response to a held force or voltage. s_j is white, and where the lines ask for it has parts
+    s/(1 + (w/w_p)²) beside, of first-order low passes; all s by Fisher scoring (Pintelon and Schoukens 2012, ch. 10,
     12).
     """
 
-    levels: Array  # (n_sources,): variance of one period's spectrum, sensors first, then disturbances
+    levels: (
+        Array  # (n_parts,): variance of one period's spectrum: white ones of sensors, of disturbances, then coloured
+    )
+    colours: tuple[tuple[int, float], ...]  # source and w_p, rad/s, of each coloured part
     covariance: Complex  # (n_lines, n_y, n_y) at the excited lines, of one period
 
-    def sd(self, period: int) -> Array:
-        """Return the rms of each source in samples of SI units."""
-        return np.asarray(np.sqrt(self.levels * period))
+    def at(self, omega: Array) -> Array:
+        """Return the variance of each source at angular frequencies, (n_lines, n_sources)."""
+        return _of_sources(self.levels, *_parts(omega, self.levels.size - len(self.colours), self.colours))
+
+    def sd(self, period: int, omega: Array) -> Array:
+        """Return the rms of each source in samples of SI units, by its mean over angular frequencies."""
+        return np.asarray(np.sqrt(self.at(omega).mean(axis=0) * period))
 
 
 def residuals(spectra: PeriodSpectra, H: Complex) -> Complex:
@@ -73,25 +86,84 @@ def fit_noise(between: Between, response_between: Sampled, sampled: Sampled, bef
     each line (`sampled`); `before`: at a model nearby.
     """
     e = between.Y - (response_between.transfer() @ between.U[:, :, None])[:, :, 0]
-    g = sources(response_between)  # (n_between, n_y, n_sources)
+    g, omega = sources(response_between), response_between.omega  # (n_between, n_y, n_sources)
+    n, colours = g.shape[2], () if before is None else before.colours
     power = np.real(np.einsum("kij,kij->kj", g.conj(), g))
     pulled = np.abs(np.einsum("kis,ki->ks", g.conj(), e)) ** 2 / np.maximum(power, 1e-300) ** 2
     alone = np.maximum(np.median(pulled, axis=0) / 2.0, 1e-300)
-    least = _LEAST * alone
     levels = alone if before is None else before.levels
+    while True:
+        of, shape = _parts(omega, n, colours)
+        levels, information = _levels(g, e, levels, _LEAST * alone[of], of, shape)
+        more = _colours_asked(g, e, omega, levels, information, of, shape) if len(colours) < _MOST_COLOURS else ()
+        if not more:
+            break
+        levels = np.concatenate([levels, levels[[j for j, _ in more]]])
+        colours = (*colours, *more)
+    at_lines = _of_sources(levels, *_parts(sampled.omega, n, colours))
+    return Noise(levels=levels, colours=colours, covariance=source_covariance(sources(sampled), at_lines))
+
+
+def _parts(omega: Array, n: int, colours: Sequence[tuple[int, float]]) -> tuple[NDArray[np.intp], Array]:
+    """Return the source of each part of the noise, white ones first, and its spectrum over its level, (n_lines,
+    n_parts).
+    """
+    low = [1.0 / (1.0 + (omega / pole) ** 2) for _, pole in colours]
+    return np.array([*range(n), *(j for j, _ in colours)]), np.column_stack([np.ones((omega.size, n)), *low])
+
+
+def _of_sources(levels: Array, of: NDArray[np.intp], shape: Array) -> Array:
+    """Return the variance of each source by those of its parts, (n_lines, n_sources)."""
+    return np.asarray((shape * levels) @ (of[:, None] == np.arange(of.max() + 1)))
+
+
+def _seen(g: Complex, e: Complex, levels: Array) -> tuple[Array, Array]:
+    """Return |gᴴ C⁻¹ e|² (n_lines, n_sources), and |gᴴ C⁻¹ g|² (n_lines, n_sources, n_sources) of sources."""
+    back = np.linalg.solve(source_covariance(g, levels), np.concatenate([g, e[:, :, None]], axis=2))
+    seen = np.abs(np.conj(np.swapaxes(g, 1, 2)) @ back) ** 2
+    return seen[:, :, -1], seen[:, :, :-1]
+
+
+def _levels(
+    g: Complex, e: Complex, levels: Array, least: Array, of: NDArray[np.intp], shape: Array
+) -> tuple[Array, Array]:
+    """Return the levels of the parts of the noise by Fisher scoring of their logarithms, and the information of the
+    levels themselves.
+    """
     for _ in range(_NOISE_STEPS):
-        back = np.linalg.solve(source_covariance(g, levels), np.concatenate([g, e[:, :, None]], axis=2))
-        back, whitened = back[:, :, :-1], back[:, :, -1]
-        power_of_sources = np.sum(np.abs(np.einsum("kis,ki->ks", g.conj(), whitened)) ** 2, axis=0)
-        products = np.conj(np.swapaxes(g, 1, 2)) @ back
-        present = np.real(np.einsum("kss->s", products))
-        information = np.sum(np.abs(products) ** 2, axis=0) * np.outer(levels, levels)
-        step = least_squares(information + 1e-9 * np.diag(np.diag(information)), levels * (power_of_sources - present))
+        power, products = _seen(g, e, _of_sources(levels, of, shape))
+        own = np.sqrt(np.einsum("kss->ks", products))
+        score = np.sum(shape * (power - own)[:, of], axis=0)
+        information = np.einsum("kp,kpq,kq->pq", shape, products[:, of][:, :, of], shape, optimize=True)
+        of_logs = information * np.outer(levels, levels)
+        step = least_squares(of_logs + 1e-9 * np.diag(np.diag(of_logs)), levels * score)
         step = np.clip(step, -2.0, 2.0)
         levels = np.maximum(levels * np.exp(step), least)
         if float(np.max(np.abs(step) * (levels > 2.0 * least))) < _NOISE_SETTLED:
             break
-    return Noise(levels=levels, covariance=source_covariance(sources(sampled), levels))
+    return levels, information
+
+
+def _colours_asked(
+    g: Complex, e: Complex, omega: Array, levels: Array, information: Array, of: NDArray[np.intp], shape: Array
+) -> tuple[tuple[int, float], ...]:
+    """Return a coloured part of each source whose score at level zero stands out; lines of hum count little."""
+    order = np.sort(omega)
+    if order.size < 2 * _COLOURED_LINES:
+        return ()
+    poles = np.geomspace(order[_COLOURED_LINES], order[-1], _POLES)
+    _, low = _parts(omega, 0, [(0, x) for x in poles.tolist()])
+    power, products = _seen(g, e, _of_sources(levels, of, shape))
+    own, inverse, asked = np.sqrt(np.einsum("kss->ks", products)), np.linalg.pinv(information, rcond=1e-9), []
+    for j in range(g.shape[2]):
+        score = low.T @ (np.minimum(power[:, j], _CLIPPED * own[:, j]) - own[:, j])
+        cross = low.T @ (products[:, j][:, of] * shape)
+        left = (low**2).T @ products[:, j, j] - np.einsum("cp,pq,cq->c", cross, inverse, cross)
+        z = score / np.sqrt(np.maximum(left, _OWN_PART * ((low**2).T @ products[:, j, j])))
+        k = int(np.argmax(z))
+        if z[k] > _COLOURED:
+            asked.append((j, float(poles[k])))
+    return tuple(asked)
 
 
 def sources(sampled: Sampled) -> Complex:
@@ -102,8 +174,8 @@ def sources(sampled: Sampled) -> Complex:
 
 
 def source_covariance(g: Complex, levels: Array) -> Complex:
-    """Return the covariance of outputs by sources, (n_lines, n_y, n_y)."""
-    return np.asarray((g * levels) @ np.conj(np.swapaxes(g, 1, 2)))
+    """Return the covariance of outputs by sources with variances (n_lines, n_sources), (n_lines, n_y, n_y)."""
+    return np.asarray((g * levels[:, None, :]) @ np.conj(np.swapaxes(g, 1, 2)))
 
 
 def feedback(spectra: PeriodSpectra, H: Complex, H_between: Complex, *, measured: bool) -> Complex | None:

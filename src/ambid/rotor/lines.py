@@ -14,7 +14,7 @@ from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.record import Record, Step
 from ambid.rotor.estimator import RotorFit
-from ambid.rotor.likelihood import Experiment, Point, Weight, sampled, source_covariance, sources
+from ambid.rotor.likelihood import Experiment, Noise, Point, Weight, sampled, source_covariance, sources
 from ambid.rotor.spectra import LEAST_LINES, Excitation, PeriodSpectra
 from ambid.rotor.synchronous import aperiodic
 
@@ -50,8 +50,8 @@ def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
         return []
     at, spectra = fit.point, e.spectra
     parts = [
-        _whitened(fit, e, at, weight.noise.levels, spectra.mean_u, np.sqrt(spectra.n_periods) * spectra.mean_y, False),
-        _whitened(fit, e, at, weight.noise.levels, spectra.between.U, spectra.between.Y, True),
+        _whitened(fit, e, at, weight.noise, spectra.mean_u, np.sqrt(spectra.n_periods) * spectra.mean_y, False),
+        _whitened(fit, e, at, weight.noise, spectra.between.U, spectra.between.Y, True),
     ]
     frequency = np.concatenate([spectra.frequency_hz, spectra.between.frequency_hz])
     order = np.argsort(frequency)
@@ -101,14 +101,14 @@ def _sharp(power: Array, own: int, least: float) -> NDArray[np.bool_]:
 
 
 def _whitened(
-    fit: RotorFit, e: Experiment, at: Point, levels: Array, U: Complex, Y: Complex, between: bool
+    fit: RotorFit, e: Experiment, at: Point, noise: Noise, U: Complex, Y: Complex, between: bool
 ) -> tuple[Complex, Complex]:
     """Return whitened residuals (n, n_y) of one period's variance, and how each source shows, (n, n_y, n_sources)."""
     of = sampled(e, fit.model, at, between=between)
     scale = 1.0 if between else np.sqrt(e.spectra.n_periods)
     left = Y - scale * (of.transfer() @ U[:, :, None])[:, :, 0]
     g = sources(of)
-    root = np.linalg.inv(np.linalg.cholesky(source_covariance(g, levels)))
+    root = np.linalg.inv(np.linalg.cholesky(source_covariance(g, noise.at(of.omega))))
     return np.asarray((root @ left[:, :, None])[:, :, 0], dtype=np.complex128), np.asarray(root @ g)
 
 
