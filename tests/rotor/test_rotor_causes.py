@@ -77,6 +77,15 @@ def test_two_planes_wrong_together_are_no_single_plane(sound: Any) -> None:
     assert not set(causes) & {"A.z", "B.z", "A.z_sensor", "B.z_sensor"}
 
 
+def test_two_planes_a_little_off_are_named_and_no_mode_stands_in_for_them() -> None:
+    bench = replace(truth.BENCHES["rigid"], m=3.0, Id=0.02, Ip=0.004, z_bearing=(-0.09, 0.11), z_sensor=(-0.11, 0.13))
+    bench = replace(bench, period=0.25)
+    found = ambid.identify(record_of(bench, 1), moved(free_rig(bench), A__z_sensor=1e-3, B__z=-1e-3))
+    assert not found.modes
+    check = found.checks["fixed_agree"]
+    assert {"A.z_sensor", "B.z"} & {check.cause, *check.alternatives}
+
+
 def test_coloured_noise_is_no_mode_and_leaves_numbers_usable(sound: Any) -> None:
     record, rig = sound
     rng, pole = np.random.default_rng(1), np.exp(-2 * np.pi * 10.0 / record.rate_hz)

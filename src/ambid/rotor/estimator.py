@@ -19,7 +19,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.rig.rotor import RigModes
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, minimise, noise_weight, rough_weight
 from ambid.rotor.modes import Candidate, scan
-from ambid.rotor.scores import sensor_gain
+from ambid.rotor.scores import other_gain
 from ambid.rotor.spectra import joined
 from ambid.rotor.start import rigid_start
 from ambid.rotor.unknowns import Unknowns
@@ -341,7 +341,7 @@ class _Work:
         w = Weight(whiten=np.concatenate([w.whiten for w in fit.problem.weights[: len(slowest)]]))
         missing = self.missing(e, fit.model, fit.point, w, _FAR_ABOVE, float(e.spectra.frequency_hz.max()))
         price = np.log(fit.problem.n_real) * (3 + len(fit.model.places))
-        if missing is None or missing.gain < max(price, sensor_gain(fit.problem, fit.vector)):
+        if missing is None or missing.gain < max(price, other_gain(fit.problem, fit.vector)):
             return None
         more = fit.model.with_modes(fit.model.n_modes + 1)
         theta = _with_mode(fit.point.theta, more, missing.named(more.n_modes))
@@ -357,7 +357,7 @@ class _Work:
     def _sensors(self, band: Sequence[Experiment], model: RotorModel, at: Point, weights: Sequence[Weight]) -> float:
         """Return what a sensor at fault would explain, which no bending mode is to stand in for."""
         problem = self.problem(band[:1], model, at, weights)
-        return sensor_gain(problem, problem.pack(at))
+        return other_gain(problem, problem.pack(at))
 
     def _whole(self, fit: RotorFit) -> Array | None:
         """Return the delays where all that are searched agree with whole samples."""

@@ -82,10 +82,15 @@ def causes_of(unknowns: Unknowns) -> tuple[Cause, ...]:
 
 def scores(problem: Likelihood, v: Array) -> list[Score]:
     """Return the causes that the residuals may have, the surest first."""
-    rows, causes = problem.rows(v, corrected=True), causes_of(problem.unknowns)
-    C = np.concatenate(_by_cause(problem, v, causes, corrected=True))
-    J, r = np.concatenate([block[:, :-1] for block in rows]), np.concatenate([block[:, -1] for block in rows])
+    causes = causes_of(problem.unknowns)
+    C, J, r = _columns_of(problem, v, causes)
     return scored(causes, C, J, r, r.size)
+
+
+def _columns_of(problem: Likelihood, v: Array, causes: Sequence[Cause]) -> tuple[Array, Array, Array]:
+    """Return what causes add to the residuals, their slopes and themselves."""
+    rows = np.concatenate(problem.rows(v, corrected=True))
+    return np.concatenate(_by_cause(problem, v, causes, corrected=True)), rows[:, :-1], rows[:, -1]
 
 
 def scored(causes: Sequence[Cause], C: Array, J: Array, r: Array, n: int) -> list[Score]:
@@ -186,9 +191,38 @@ def _searched(problem: Likelihood, v: Array, s: Score, before: float) -> Score:
     return replace(s, z=z, size=size, gain=gain, shift=v - best.theta[:-1])
 
 
-def sensor_gain(problem: Likelihood, v: Array) -> float:
-    """Return by how much a channel's gain, lag or cross-talk, or an eddy pole, would lower the sum of squares."""
-    return max((s.gain for s in scores(problem, v) if s.cause.kind != "fixed"), default=0.0)
+def other_gain(problem: Likelihood, v: Array) -> float:
+    """Return by how much what a mode may stand in for would lower the sum of squares: a channel's gain, lag or
+    cross-talk, an eddy pole, or the fixed numbers all together, as two planes at wrong places are.
+    """
+    causes = [c for c in causes_of(problem.unknowns) if "+" not in c.name]
+    C, J, r = _columns_of(problem, v, causes)
+    alone = (s.gain for s in scored(causes, C, J, r, r.size) if s.cause.kind != "fixed")
+    return max(_together(J, C[:, [c.kind == "fixed" for c in causes]], r).gain, *alone, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Joint:
+    """Several columns in the residuals at once."""
+
+    sizes: Array  # what the columns would have to be, by axes that the residuals tell apart, (n_axes,)
+    information: Array  # of these, (n_axes,)
+    shift: Array  # by how much one of each has moved the vector, (n_vector, n_axes)
+
+    @property
+    def gain(self) -> float:
+        """By how much they would lower the sum of squares."""
+        return float(np.sum(self.sizes**2 * self.information))
+
+
+def _together(J: Array, C: Array, r: Array) -> _Joint:
+    """Return what columns C (n_rows, n) explain of residuals r outside the space of the slopes J."""
+    C = C / np.maximum(np.linalg.norm(C, axis=0), 1e-300)
+    moved = directions(J).solve(C)
+    outside = C - J @ moved
+    values, axes = np.linalg.eigh(outside.T @ outside)
+    axes, values = axes[:, values > _OWN], values[values > _OWN]
+    return _Joint(sizes=axes.T @ (outside.T @ r) / values, information=values, shift=moved @ axes)
 
 
 def _columns(
@@ -409,7 +443,6 @@ class Bent:
     # covariance that numbers by the names of `shift` have beside that of the record: what the shift is, not taken out,
     # and how far it is known
     more: Array
-
     other: str = ""  # what explains the residuals better, so that the shift is none of curvature
 
     def instead(self, other: str) -> Bent:
@@ -424,25 +457,18 @@ def curvature(problem: Likelihood, v: Array) -> Bent | None:
         return None
     rows, at = np.concatenate(problem.rows(v, corrected=True)), problem.point(v)
     pairs = zip(problem.experiments, problem.weights, strict=True)
-    C = np.concatenate([_bent(problem, e, w, at) for e, w in pairs])
-    C /= np.linalg.norm(C, axis=0)
-    J, r = rows[:, :-1], rows[:, -1]
-    moved = directions(J).solve(C)
-    outside = C - J @ moved
-    values, axes = np.linalg.eigh(outside.T @ outside)
-    axes, values = axes[:, values > _OWN], values[values > _OWN]
-    along = axes.T @ (outside.T @ r)
-    gain = float(np.sum(along**2 / values))
-    p = chi_squared_tail(max(values.size, 1), gain / max(1.0, float(r @ r) / r.size))
+    C, J, r = np.concatenate([_bent(problem, e, w, at) for e, w in pairs]), rows[:, :-1], rows[:, -1]
+    joint = _together(J, C, r)
+    p = chi_squared_tail(max(joint.sizes.size, 1), joint.gain / max(1.0, float(r @ r) / r.size))
     if p > _CHANCE:
-        return Bent(gain=gain, p=p, shift={}, more=np.zeros((0, 0)))
+        return Bent(gain=joint.gain, p=p, shift={}, more=np.zeros((0, 0)))
     names, chain = problem.unknowns.chain(v)
     late = problem.unknowns.free_delays
-    of_sizes = chain[[*range(len(names)), *(len(names) + k for k in late)]] @ moved @ axes
+    of_sizes = chain[[*range(len(names)), *(len(names) + k for k in late)]] @ joint.shift
     names = (*names, *(f"{model.inputs[k]}.delay" for k in late))
-    shift = of_sizes @ (along / values)
-    more = np.outer(shift, shift) + (of_sizes / values) @ of_sizes.T
-    return Bent(gain=gain, p=p, shift=dict(zip(names, shift.tolist(), strict=True)), more=np.asarray(more))
+    shift = of_sizes @ joint.sizes
+    more = np.outer(shift, shift) + (of_sizes / joint.information) @ of_sizes.T
+    return Bent(gain=joint.gain, p=p, shift=dict(zip(names, shift.tolist(), strict=True)), more=np.asarray(more))
 
 
 def _bent(problem: Likelihood, e: Experiment, w: Weight, at: Point) -> Array:
