@@ -102,6 +102,14 @@ def test_coloured_noise_is_no_mode_and_leaves_numbers_usable(sound: Any) -> None
     assert not [p.name for p in found.parameters if p.sd and abs(p.value - theta[p.name]) > 3.8 * p.sd]
 
 
+def test_a_reversed_position_is_not_blamed_on_the_magnets(sound: Any) -> None:
+    record, rig = sound
+    found = ambid.identify(changed(record, ax_position=np.negative), rig)
+    assert found.verdict.word == "unusable"
+    assert found.checks["curvature"].passed
+    assert "something else is wrong" in found.checks["curvature"].detail
+
+
 def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:
     """Without voltages a fixed mass sets the scale of all, and no record says anything against it."""
     found = ambid.identify(sound[0], driven(sound[1], 6.2))

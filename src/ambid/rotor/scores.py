@@ -431,6 +431,7 @@ def _words(s: Score, unit: str) -> str:
 _DEGREE = 4
 _CHANCE = 1e-4  # probability below which curvature counts as seen
 _HARMLESS, _BENT = 1.5, 8.0  # standard deviations that it may move a number by, to be silent, and to be held
+_MAIN = 0.5  # part of what the model leaves, that curvature has to explain to be its cause
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -443,6 +444,7 @@ class Bent:
     # covariance that numbers by the names of `shift` have beside that of the record: what the shift is, not taken out,
     # and how far it is known
     more: Array
+    share: float = 1.0  # of what the residuals hold beyond noise, that it would explain
     other: str = ""  # what explains the residuals better, so that the shift is none of curvature
 
     def instead(self, other: str) -> Bent:
@@ -468,7 +470,10 @@ def curvature(problem: Likelihood, v: Array) -> Bent | None:
     names = (*names, *(f"{model.inputs[k]}.delay" for k in late))
     shift = of_sizes @ joint.sizes
     more = np.outer(shift, shift) + (of_sizes / joint.information) @ of_sizes.T
-    return Bent(gain=joint.gain, p=p, shift=dict(zip(names, shift.tolist(), strict=True)), more=np.asarray(more))
+    return Bent(
+        gain=joint.gain, p=p, shift=dict(zip(names, shift.tolist(), strict=True)), more=np.asarray(more),
+        share=joint.gain / max(float(r @ r) - r.size, joint.gain),
+    )  # fmt: skip
 
 
 def _bent(problem: Likelihood, e: Experiment, w: Weight, at: Point) -> Array:
@@ -514,6 +519,11 @@ def curvature_check(bent: Bent, sd: Mapping[str, float]) -> Check:
     if bent.other:
         text = f"curvature of the magnets would explain less than {bent.other}: it is not held in the intervals"
         return Check(passed=True, p=bent.p, detail=text)
+    if bent.share < _MAIN and z > _BENT:
+        text = (
+            f"curvature of the magnets would explain {bent.share:.0%} of what the model leaves: something else is wrong"
+        )
+        return Check(passed=True, p=bent.p, values={"z": z}, detail=text)
     if z <= _HARMLESS:
         return Check(passed=True, p=bent.p, detail="no curvature of the magnets shows that moves a number")
     held = z <= _BENT
