@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, EstimationError
 from ambid.record import Record
 from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
@@ -82,3 +82,9 @@ def test_an_estimate_without_a_finite_response_leaves_unbalance_out_and_says_so(
     found = ambid.identify([still, turning], free_rig(bench))
     assert not found.synchronous
     assert any("unbalance was not worked out" in line for line in found.warnings)
+
+
+def test_axes_that_nothing_moves_are_refused_by_name() -> None:
+    bench = _bench("rigid", excited=(0, 2))
+    with pytest.raises(EstimationError, match="ay, by move no more than their noise"):
+        ambid.identify(record_of(bench, 1), free_rig(bench))

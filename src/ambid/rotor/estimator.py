@@ -35,6 +35,7 @@ _CLEAR = 0.5  # part of the residuals that a mode explains, from which no sensor
 _FAR_ABOVE = 2.0
 _BESIDE = 1.05  # how far a mode may stand from where the rig says, or from the highest line
 _LEAST_LINES = 24
+_MOVES = 1.5  # power of a position at the excited lines, over that of its noise, from which it is moved
 _MOST_MODES = 9
 _WHOLE = 1e-4  # samples by which a delay may miss a whole number however exact it is: R hardly moves by that
 _SAME_SPEED = 0.01  # relative difference of speeds that count as one for the start
@@ -98,6 +99,12 @@ def estimate_rotor(
     with whole samples are held there, and the last search is repeated.
     """
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
+    if idle := _idle(ordered, model):
+        names = ", ".join(idle)
+        raise EstimationError(
+            f"{names} move no more than their noise, and at rest no other axis moves them. Excite them too, or omit "
+            "them from the rig: the others are identified without"
+        )
     work = _Work(
         model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), modes=modes,
         tick=tick,
@@ -395,6 +402,17 @@ def _below(at: Point, experiments: Sequence[Experiment]) -> bool:
     """Whether a mode ran below the lowest line: nothing of it shows there, and it stands in for something else."""
     low = min(float(e.spectra.omega.min()) for e in experiments)
     return any(x < low for name, x in at.theta.items() if name.startswith("mode") and name.endswith(".omega"))
+
+
+def _idle(experiments: Sequence[Experiment], model: RotorModel) -> list[str]:
+    """Return the axes of the planes that stand still but for noise in all experiments; none where the rotor turns."""
+    if any(model.at_speed(e.speed).turning for e in experiments):
+        return []
+    spectra = [e.spectra for e in experiments]
+    over = np.max([np.mean(np.abs(s.mean_y) ** 2 / s.scatter[1], axis=0) * s.n_periods for s in spectra], axis=0)
+    plane = np.array([p for _, p in model.placed])
+    moved = {int(plane[j]) for k, (j, _) in enumerate(model.sensors) if over[k] > _MOVES}
+    return [axis for axis, p in zip(model.axes, plane, strict=True) if p not in moved] if moved else []
 
 
 def _slowest(ordered: Sequence[Experiment]) -> list[Experiment]:
