@@ -110,6 +110,18 @@ def test_a_reversed_position_is_not_blamed_on_the_magnets(sound: Any) -> None:
     assert "something else is wrong" in found.checks["curvature"].detail
 
 
+def test_two_faults_at_once_are_both_named_and_in_the_intervals(sound: Any) -> None:
+    record, rig = sound
+    late = filtered(record, "ax_position", 2e3)
+    found = ambid.identify(changed(late, ay_position=lambda x: 1.01 * x), rig)
+    check = found.checks["sensors_agree"]
+    assert check.cause == "ax_position.lag"
+    assert "ay_position.gain" in check.alternatives
+    assert "With that taken out, ay_position.gain (+" in check.detail
+    _, theta = model_of(replace(truth.BENCHES["rigid"], period=0.25))
+    assert not [p.name for p in found.parameters if p.sd and abs(p.value - theta[p.name]) > 3.8 * p.sd]
+
+
 def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:
     """Without voltages a fixed mass sets the scale of all, and no record says anything against it."""
     found = ambid.identify(sound[0], driven(sound[1], 6.2))

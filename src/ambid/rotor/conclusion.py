@@ -19,7 +19,17 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
 from ambid.rotor.prediction import PredictorFit
-from ambid.rotor.scores import Bent, Score, agreement_checks, curvature, curvature_check, refined, scores, suspects
+from ambid.rotor.scores import (
+    Bent,
+    Score,
+    agreement_checks,
+    beside,
+    curvature,
+    curvature_check,
+    refined,
+    scores,
+    suspects,
+)
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
@@ -86,8 +96,8 @@ class Evidence:
 def of_periods(fit: RotorFit) -> Evidence:
     """Return the evidence of period spectra."""
     found, numbers = refined(fit.problem, fit.vector, scores(fit.problem, fit.vector)), numbers_of(fit)
-    sd = {name: numbers.sd(name) for name in numbers.names}
-    agree, bent = agreement_checks(found, fit.model), curvature(fit.problem, fit.vector)
+    sd, more = {name: numbers.sd(name) for name in numbers.names}, beside(fit.problem, fit.vector, found)
+    agree, bent = agreement_checks(found, fit.model, more), curvature(fit.problem, fit.vector)
     named = next((c.cause for c in agree.values() if not c.passed), "")
     if bent and bent.shift and named and bent.gain < found[0].gain:  # no more than what is named does
         bent = bent.instead(named)
@@ -96,7 +106,7 @@ def of_periods(fit: RotorFit) -> Evidence:
         noise=_noise(fit),
         fit=_fits(fit),
         bent=bent,
-        shifts=shifts_of(fit, found),
+        shifts=[*shifts_of(fit, found), *shifts_of(fit, more)],
         checks={
             **_residual_checks(fit),
             **({"curvature": curvature_check(bent, sd)} if bent else {}),

@@ -305,9 +305,9 @@ def _freed(spectra: PeriodSpectra, model: RotorModel, error: SensorError, size: 
     return replace(spectra, U=U, Y=Y)
 
 
-def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Check]:
+def agreement_checks(found: Sequence[Score], model: RotorModel, more: Sequence[Score] = ()) -> dict[str, Check]:
     """Judge what is fixed, and the channels, by their scores. What explains the residuals best is named, with what
-    explains them about as well; the other check does not fail for what that explains.
+    explains them about as well, and what shows besides (`more`); the other check does not fail for what that explains.
     """
     if not found:
         return {}
@@ -334,10 +334,12 @@ def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Che
             shown = [_shown(s, units) for s in alike] + [words.get(x, x) for x in others[len(alike) :]]
             if shown:
                 detail += f"; about as well explained by {' or '.join(shown)}"
+            if more:
+                detail += f". With that taken out, {' or '.join(_shown(s, units) for s in more)} shows too"
         checks[name] = Check(
             passed=passed, values={"z": worst.z, "size": worst.size}, detail=detail,
             cause="" if passed else worst.cause.name, size=None if passed else worst.size,
-            alternatives=() if passed else tuple(others),
+            alternatives=() if passed else tuple(dict.fromkeys([*others, *(s.cause.name for s in more)])),
         )  # fmt: skip
     return checks
 
@@ -351,6 +353,16 @@ def _alike(found: Sequence[Score]) -> list[Score]:
 def suspects(found: Sequence[Score]) -> list[Score]:
     """Return the score that a check fails for, and those about as good; none where the checks pass."""
     return [found[0], *_alike(found)] if found and abs(found[0].z) >= _FAR else []
+
+
+def beside(problem: Likelihood, v: Array, found: Sequence[Score]) -> list[Score]:
+    """Return the causes that show once the one that a check fails for is taken out of the record."""
+    if not suspects(found):
+        return []
+    first = found[0]
+    v = v - first.shift[: v.size]
+    left = scores(_without(problem, v, first.cause, first.size), v)
+    return suspects([s for s in left if s.cause != first.cause])
 
 
 def _leads(s: Score) -> bool:
