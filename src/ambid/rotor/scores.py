@@ -97,8 +97,7 @@ def scored(causes: Sequence[Cause], C: Array, J: Array, r: Array, n: int) -> lis
     """Return scores by what each cause adds, C (n_rows, n_causes), slopes J and residuals r; `n`: real residuals."""
     rows = triangle_of([np.column_stack([J, C, r])])
     J, C, r = rows[:, : J.shape[1]], rows[:, J.shape[1] : -1], rows[:, -1]
-    moved = directions(J).solve(C)
-    outside = C - J @ moved
+    outside, moved = _outside(J, C)
     own, whole = np.sum(outside**2, axis=0), np.sum(C**2, axis=0)
     along = outside.T @ r
     spread = np.sqrt(max(1.0, float(r @ r) / n))
@@ -218,11 +217,16 @@ class _Joint:
 def _together(J: Array, C: Array, r: Array) -> _Joint:
     """Return what columns C (n_rows, n) explain of residuals r outside the space of the slopes J."""
     C = C / np.maximum(np.linalg.norm(C, axis=0), 1e-300)
-    moved = directions(J).solve(C)
-    outside = C - J @ moved
+    outside, moved = _outside(J, C)
     values, axes = np.linalg.eigh(outside.T @ outside)
     axes, values = axes[:, values > _OWN], values[values > _OWN]
     return _Joint(sizes=axes.T @ (outside.T @ r) / values, information=values, shift=moved @ axes)
+
+
+def _outside(J: Array, C: Array) -> tuple[Array, Array]:
+    """Return columns outside the space of the slopes, and by how much one of each has moved the vector."""
+    moved = directions(J).solve(C)
+    return C - J @ moved, moved
 
 
 def _columns(
