@@ -203,6 +203,18 @@ def test_a_machine_is_judged_by_its_own_clearances_and_speeds(spindle):
     assert [machine.operates_at(n * RPM) for n in (3_000.0, 24_900.0, 30_000.0)] == [False, True, True]
 
 
+def test_the_synchronous_part_is_taken_out_once(spindle, monkeypatch):
+    from ambid.rotor import synchronous
+
+    def never(*_):
+        raise AssertionError("the synchronous part is apart already")
+
+    monkeypatch.setattr(synchronous, "separate", never)
+    accepted = ambid.accept(spindle.record, spindle.rig)
+    for p in spindle.estimate.parameters:
+        assert accepted.estimate[p.name].value == pytest.approx(p.value, abs=0.1 * p.sd), p.name
+
+
 def test_a_dead_sensor_is_refused(spindle):
     dead = tuple(
         replace(c, values=np.zeros(c.values.size)) if c.name == "bx_position" else c for c in spindle.record.channels

@@ -118,7 +118,8 @@ def accept(
                 f"Give one, or {setting('estimate')}"
             )
         speeds = [b.speed * _RPM for b in chosen]
-        of_machine = identify_rotor([b.record for b in chosen], bench, speed_rpm=speeds, tick=say)
+        apart = [b.apart for b in chosen if b.apart is not None]
+        of_machine = identify_rotor([b.record for b in chosen], bench, speed_rpm=speeds, tick=say, apart=apart)
     clock.lap("identify")
     say("items")
     with one_thread():

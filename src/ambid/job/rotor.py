@@ -45,10 +45,12 @@ def identify_rotor(
     *,
     speed_rpm: float | Sequence[float] | None = None,
     tick: Tick | None = None,
+    apart: Sequence[Separated] = (),
     **reading: Unpack[Reading],
 ) -> RotorEstimate:
     """Identify a rotor by a `rig` with bearings: two or more whole periods by the estimator on period spectra, else by
-    the predictor. `speed_rpm`: of each record; `reading`: of files. EstimationError where nothing can be identified.
+    the predictor. `speed_rpm`: of each record; `apart`: their synchronous parts, where each is one experiment whose
+    part is known; `reading`: of files. EstimationError where nothing can be identified.
     """
     from ambid.estimation.calibration import calibrated
     from ambid.job.closed_loop import loop_and_peaks
@@ -63,7 +65,7 @@ def identify_rotor(
         _check(bench, rig)
     clock.lap("read")
     say("periods")
-    turning = [separate(r.bench, model, r.speed) for r in readings]
+    turning = apart or [separate(r.bench, model, r.speed) for r in readings]
     warnings = [said for r in readings for said in r.warnings]
     for r, x in zip(readings, turning, strict=True):
         rig_speed = model.speed if len(readings) == 1 else 0.0  # the rig's is that of one record
