@@ -17,7 +17,7 @@ from ambid.record import Record
 from ambid.rig import Rig, rig_of_preset
 from ambid.rig.rotor import RigModes
 from ambid.rotor.conclusion import shifts_of
-from ambid.rotor.estimator import estimate_rotor
+from ambid.rotor.estimator import estimate_rotor, unknowns_at
 from ambid.rotor.likelihood import Experiment
 from ambid.rotor.lines import Line, apart
 from ambid.rotor.scores import Cause, Score, agreement_checks, scored
@@ -228,6 +228,13 @@ def test_a_shift_beyond_first_order_stays_finite(sound: Any) -> None:
     names, _ = fit.unknowns.chain(fit.vector)
     assert np.all(np.isfinite(shift))
     assert shift[names.index("m")] == pytest.approx((1.0 - np.exp(3.0)) * fit.point.theta["m"])
+    bent = fit.model.with_modes(1)
+    of_mode = {p.name: 1.0 for p in bent.mode_parameters} | {"mode1.omega": 900.0, "mode1.zeta": 0.01}
+    at = replace(fit.point, theta={**fit.point.theta, **of_mode})
+    unknowns = unknowns_at(bent, known, at, ())
+    fit = replace(fit, unknowns=unknowns, base=at, vector=unknowns.pack(at.theta, at.delays))
+    far = replace(far, shift=np.full(fit.vector.size, -1e3), spread=np.zeros(fit.vector.size))
+    assert np.all(np.isfinite(shifts_of(fit, [far])[0]))
 
 
 def test_a_score_does_not_depend_on_slopes_that_are_nearly_alike() -> None:

@@ -119,8 +119,9 @@ def shifts_of(fit: Ending, found: Sequence[Score]) -> list[Array]:
     """Return by how much each cause that is named has moved the numbers, and how far that is known."""
     names, chain = fit.unknowns.chain(fit.vector)
     free, n, shifts = list(fit.unknowns.free_delays), fit.vector.size, list[Array]()
+    logs = [k for k, x in enumerate(fit.unknowns.names) if k < len(fit.unknowns.logs) or x.endswith(".l")]
     for s in suspects(found):
-        shift, logs = s.shift[:n].copy(), slice(len(fit.unknowns.logs))
+        shift = s.shift[:n].copy()
         shift[logs] = np.clip(shift[logs], -_FOLD, _FOLD)
         points = (fit.point, replace(fit, vector=fit.vector - shift).point)
         is_now, would_be = (np.array([*(p.theta[x] for x in names), *p.delays[free]]) for p in points)

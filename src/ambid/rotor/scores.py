@@ -361,7 +361,7 @@ def suspects(found: Sequence[Score]) -> list[Score]:
 
 def beside(problem: Likelihood, v: Array, found: Sequence[Score]) -> list[Score]:
     """Return the causes that show once the one that a check fails for is taken out of the record."""
-    if not suspects(found):
+    if not suspects(found) or not np.isfinite(problem.cost(v - found[0].shift[: v.size])):
         return []
     first = found[0]
     v = v - first.shift[: v.size]
