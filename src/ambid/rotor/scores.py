@@ -27,6 +27,7 @@ _OWN = 1e-5  # part of a column outside the Jacobian's space, squared, below whi
 _ALIKE = 0.7  # part of the strongest cause's gain from which another explains the record about as well
 _CLOSE = 9.0  # and the difference of gains within which it does in any case
 _LARGE = 1.5  # mean square of the residuals from which an error is not of first order
+_MAIN = 0.5  # part of what the model leaves, that curvature or a second cause has to explain
 _WORTH, _MOST, _STEPS = 0.1, 8, 30  # part of the best gain from which a cause is searched, how many, steps
 _TOGETHER = {"position": "positions", "current": "currents", "voltage": "voltages"}
 
@@ -360,13 +361,15 @@ def suspects(found: Sequence[Score]) -> list[Score]:
 
 
 def beside(problem: Likelihood, v: Array, found: Sequence[Score]) -> list[Score]:
-    """Return the causes that show once the one that a check fails for is taken out of the record."""
+    """Return the causes that explain most of what is left once the one that a check fails for is taken out."""
     if not suspects(found) or not np.isfinite(problem.cost(v - found[0].shift[: v.size])):
         return []
     first = found[0]
     v = v - first.shift[: v.size]
-    left = scores(_without(problem, v, first.cause, first.size), v)
-    return suspects([s for s in left if s.cause != first.cause])
+    freed, n = _without(problem, v, first.cause, first.size), problem.n_real
+    found = suspects([s for s in scores(freed, v) if s.cause != first.cause])
+    left = freed.cost(v) - n - 2.0 * np.sqrt(2.0 * n)  # beyond chance: what is taken out in part leaves a rest
+    return found if found and found[0].gain > _MAIN * left else []
 
 
 def _leads(s: Score) -> bool:
@@ -447,7 +450,6 @@ def _words(s: Score, unit: str) -> str:
 _DEGREE = 4
 _CHANCE = 1e-4  # probability below which curvature counts as seen
 _HARMLESS, _BENT = 1.5, 8.0  # standard deviations that it may move a number by, to be silent, and to be held
-_MAIN = 0.5  # part of what the model leaves, that curvature has to explain to be its cause
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
