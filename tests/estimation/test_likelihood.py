@@ -261,3 +261,21 @@ def test_linearise_and_innovations_agree():
     e = innovations(problem, vector)
     at = linearise(problem, vector, np.eye(2))
     assert np.linalg.norm(at.r) == pytest.approx(np.linalg.norm(e), rel=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4])
+def test_steps_of_several_samples_know_a_disturbance_at_each_sample(delay):
+    """Without correction by outputs, errors of prediction at every third sample are those of single steps."""
+    bench = run("thesis", 600, 5)
+    bench = replace(bench, delay=delay)
+    known = np.random.default_rng(1).standard_normal((600, 2)) * [0.1, 1.0]
+    gain = np.zeros((3, 2))
+    single, vector = problem_of(bench, noise="given", gain=gain, extra=known)
+    several, _ = problem_of(bench, noise="given", gain=gain, extra=known, stride=3)
+    np.testing.assert_allclose(innovations(several, vector), innovations(single, vector)[::3], rtol=1e-9, atol=1e-9)
+    at = assemble(several, vector)
+    for q in range(several.n_physical):
+        step = np.eye(several.size)[q] * 1e-6
+        ends = [assemble(several, vector + sign * step, with_derivatives=False).M for sign in (1.0, -1.0)]
+        slope = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(at.dM[:, :, q], slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())

@@ -35,7 +35,7 @@ class Workspace:
         self.y = problem.y[problem.skip :: problem.stride] / problem.scales.output
         n, (n_u, n_y) = len(problem.model.states), (problem.u.shape[1], problem.y.shape[1])
         extra = None if problem.extra is None else problem.extra[problem.skip :] / problem.scales.disturbance
-        n_d = 0 if extra is None else extra.shape[1]
+        n_d = 0 if extra is None else extra.shape[1] * problem.stride
         self.w = np.empty((n_used, n + len(problem.lags) * n_u + n_d + n_y + 1))
         self.z = self.w[:, n:]
         for j, s in enumerate(problem.lags):
@@ -45,9 +45,9 @@ class Workspace:
             here[: there.shape[0]] = there
             here[there.shape[0] :] = problem.u[-1]
             here /= problem.scales.input
-        if extra is not None:  # over a step of several samples, their mean
-            ends = np.append(np.arange(0, len(extra), problem.stride), len(extra))
-            self.z[:, -1 - n_y - n_d : -1 - n_y] = np.add.reduceat(extra, ends[:-1]) / np.diff(ends)[:, None]
+        if extra is not None:  # of each sample of a step; after the last sample there is none
+            missing = n_used * problem.stride - len(extra)
+            self.z[:, -1 - n_y - n_d : -1 - n_y] = np.pad(extra, ((0, missing), (0, 0))).reshape(n_used, n_d)
         self.z[:, -1 - n_y : -1], self.z[:, -1] = self.y, 1.0
         self.turn: tuple[Array, Array] | None = None
         self._problem = problem
@@ -444,10 +444,10 @@ def promise_of(rows: tuple[Array, Array] | None) -> float:
     return 0.0 if rows is None else directions(rows[0]).explain(rows[1])
 
 
-def free_one(fit: Fit, name: str) -> tuple[float, float]:
+def free_one(fit: Fit, name: str) -> tuple[float, Array]:
     """Return what the data say of a fixed parameter, to second order: the fall of the criterion that freeing it
-    promises (chi-squared with one degree of freedom if its value is right), and where one Newton step puts it, SI:
-    right in direction, in size only near the fixed value.
+    promises (chi-squared with one degree of freedom if its value is right), and by how much one Newton step moves the
+    estimated parameters and, last, the freed one, SI: right in direction, in size only near the fixed value.
     """
     old = fit.problem
     value = old.known[name]
@@ -465,11 +465,11 @@ def free_one(fit: Fit, name: str) -> tuple[float, float]:
     vector = np.insert(fit.vector, n, value / size)
     rows = extend(fit, problem, vector)
     if rows is None:
-        return 0.0, value
+        return 0.0, np.zeros(n + 1)
     axes, residual = directions(rows[0]), rows[1]
     if not axes.seen.all():  # the data cannot tell it from the others
-        return 0.0, value
-    return axes.explain(residual), value - float(axes.solve(residual)[n]) * size
+        return 0.0, np.zeros(n + 1)
+    return axes.explain(residual), -axes.solve(residual)[: n + 1] * problem.magnitude
 
 
 def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) -> Array:

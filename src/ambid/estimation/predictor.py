@@ -345,6 +345,7 @@ class Step:
     A: Array  # (n, n)
     inputs: Array  # (n, n_lags n_inputs), input matrices at the problem's lags
     E: Array  # (n, n_disturbances)
+    known: Array  # (n, stride n_disturbances), of disturbances that are known at each sample of the step
 
 
 def assemble(
@@ -408,14 +409,14 @@ def _recursion(
     if not stable(F):
         return None
     extra = problem.extra is not None
-    M = np.hstack([F, step.inputs, *([step.E] if extra else []), K, (step.E @ offset)[:, None]])
+    M = np.hstack([F, step.inputs, *([step.known] if extra else []), K, (step.E @ offset)[:, None]])
     dM = np.zeros((*M.shape, 0 if dK is None else problem.size))
     dE, dC = np.zeros((*step.E.shape, dM.shape[2])), None
     if dK is not None:
         n, first_y = F.shape[0], M.shape[1] - 1 - K.shape[1]
         for q, d in enumerate(step_slopes):  # physical parameters, then the delay
             dM[:, :n, q], dM[:, -1, q] = d.A, d.E @ offset
-            dM[:, n:first_y, q] = np.hstack([d.inputs, d.E]) if extra else d.inputs
+            dM[:, n:first_y, q] = np.hstack([d.inputs, d.known]) if extra else d.inputs
             dE[:, :, q] = d.E
         dC = _slopes_of_C(slopes, plant.C)
         if dC is not None:
@@ -559,8 +560,13 @@ def _stepped(
     problem: PredictorProblem, lag: Array, plant: DiscreteSpace, slopes: Sequence[DiscreteSpace]
 ) -> tuple[Step, list[Step]]:
     """Put the inputs at their lags and take the plant over `stride` samples, with derivatives by the product rule."""
+
+    def single(inputs: Array, moved: Sequence[Array]) -> tuple[Step, list[Step]]:
+        of_slopes = [Step(A=d.A, inputs=b, E=d.E, known=d.E) for d, b in zip(slopes, moved, strict=True)]
+        return Step(A=plant.A, inputs=inputs, E=plant.E, known=plant.E), of_slopes
+
     if problem.lags == (0,):
-        return Step(A=plant.A, inputs=plant.B, E=plant.E), [Step(A=d.A, inputs=d.B, E=d.E) for d in slopes]
+        return single(plant.B, [d.B for d in slopes])
     n, n_u = plant.B.shape
     place, columns = np.floor(lag).astype(int) - problem.taps[0], np.arange(n_u)
 
@@ -575,13 +581,12 @@ def _stepped(
 
     one = np.eye(n)
     if problem.stride == 1:
-        first = Step(A=plant.A, inputs=spread(plant.B, plant.B_late, [one]), E=plant.E)
-        return first, [Step(A=d.A, inputs=spread(d.B, d.B_late, [one]), E=d.E) for d in slopes]
+        now = spread(plant.B, plant.B_late, [one])
+        return single(now, [spread(d.B, d.B_late, [one]) for d in slopes])
     powers = [one]
     for _ in range(problem.stride):
         powers.insert(0, plant.A @ powers[0])
     whole, steps = powers[0], powers[1:]
-    sums = np.sum(steps, axis=0)
     result = []
     for d in slopes:
         slopes_of_powers = [np.zeros((n, n))]
@@ -589,5 +594,8 @@ def _stepped(
             slopes_of_powers.insert(0, d.A @ power + plant.A @ slopes_of_powers[0])
         d_whole, d_steps = slopes_of_powers[0], slopes_of_powers[1:]
         inputs = spread(d.B, d.B_late, steps) + spread(plant.B, plant.B_late, d_steps)
-        result.append(Step(A=d_whole, inputs=inputs, E=sums @ d.E + np.sum(d_steps, axis=0) @ plant.E))
-    return Step(A=whole, inputs=spread(plant.B, plant.B_late, steps), E=sums @ plant.E), result
+        known = [power @ d.E + slope @ plant.E for power, slope in zip(steps, d_steps, strict=True)]
+        result.append(Step(A=d_whole, inputs=inputs, E=np.sum(known, axis=0), known=np.hstack(known)))
+    known = [power @ plant.E for power in steps]
+    inputs = spread(plant.B, plant.B_late, steps)
+    return Step(A=whole, inputs=inputs, E=np.sum(known, axis=0), known=np.hstack(known)), result

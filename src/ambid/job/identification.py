@@ -274,10 +274,7 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
             break
         fit, taken = more
         estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
-        checks, agree = dict(estimate.checks), estimate.checks["estimates_agree"]
-        if agree.passed and not agree.values["refits"]:  # none was possible: those without the causes count
-            checks["estimates_agree"] = first.checks["estimates_agree"]
-        estimate = replace(estimate, checks=checks, extended=tuple(dict.fromkeys(told(c) for c in taken)))
+        estimate = replace(estimate, extended=tuple(dict.fromkeys(told(c) for c in taken)))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
     worse = after & _OF_THE_MODEL or after - before - {"fixed_agree"} or len(after) >= len(before)
     return first if worse else estimate

@@ -73,7 +73,6 @@ class Agreement:
     # that its variance less that of the fit is that of their difference (Hausman 1978)
     sd: Array
     strides: tuple[int, ...]  # of the refits that converged
-    fast: bool = False  # whether no refit was possible, since known disturbances change within its samples
 
     @property
     def largest(self) -> float:
@@ -82,8 +81,8 @@ class Agreement:
 
     @property
     def passed(self) -> bool:
-        """Whether there was a refit, if one was possible, and every shift is within 4 standard deviations."""
-        return (bool(self.strides) or self.fast) and self.largest < _MOST
+        """Whether there was a refit, and every shift is within 4 standard deviations."""
+        return bool(self.strides) and self.largest < _MOST
 
     def beyond_chance(self) -> Array:
         """Return how far each parameter moves beyond chance in each refit, (n_refits, n), SI."""
@@ -186,9 +185,7 @@ def _explain_columns(fit: Fit, sums: Products, cross: Array, inner: Array) -> tu
 
 def _estimates_agree(moved: Agreement) -> Check:
     every = " and ".join(f"{s}{'nd' if s == 2 else 'th'}" for s in moved.strides)
-    if moved.fast:
-        detail = "no refit to every 2nd output sample: what the model was extended by changes within it"
-    elif not moved.strides:
+    if not moved.strides:
         detail = "refits to every 2nd or 4th output sample failed: the model fits one step ahead only"
     elif moved.passed:
         detail = f"refits to every {every} output sample agree (largest parameter shift {moved.largest:.1f} sd)"
@@ -211,9 +208,8 @@ def agreement(fit: Fit) -> Agreement:
     problem = fit.problem
     size, n = problem.magnitude, problem.n_physical
     shifts, spreads, strides = [], [], []
-    possible = [s for s in _STRIDES if problem.extra is None or _even(problem.extra, s)]
     own = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
-    for stride in possible:
+    for stride in _STRIDES:
         try:
             sparse = replace(problem, stride=stride, noise="given", gain=sparse_gain(fit, stride))
         except np.linalg.LinAlgError:  # no gain that stabilises is found: a refit less, not a job without an estimate
@@ -232,14 +228,7 @@ def agreement(fit: Fit) -> Agreement:
         shift=np.array(shifts).reshape(-1, n),
         sd=np.array(spreads).reshape(-1, n),
         strides=tuple(strides),
-        fast=not possible,
     )
-
-
-def _even(signals: Array, stride: int) -> bool:
-    """Return whether signals (n, n_signals) hardly change within `stride` samples, as their mean over these takes."""
-    whole = signals[: len(signals) // stride * stride].reshape(-1, stride, signals.shape[1])
-    return bool(np.all(np.std(whole, axis=1).mean(0) <= _EVEN * np.maximum(signals.std(0), 1e-300)))
 
 
 def assumption_checks(fit: Fit, spread: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
@@ -260,12 +249,12 @@ def _fixed_agree(fit: Fit) -> Check:
     units = {p.name: p.unit for p in fit.problem.model.parameters}
     worst, most, detail = 1.0, 0.0, "the data agree with every fixed value"
     for name, value in fit.problem.known.items():
-        statistic, there = free_one(fit, name)
+        statistic, step = free_one(fit, name)
         p = chi_squared_tail(1, statistic)
         if p < min(worst, P_LEAST):
             detail = (
                 f"the data contradict the fixed {name} = {value:.4g} {units[name]}; a "
-                f"{'larger' if there > value else 'smaller'} value fits better ({p_text(p)}). Check it, or free it"
+                f"{'larger' if step[-1] > 0 else 'smaller'} value fits better ({p_text(p)}). Check it, or free it"
             )
         worst, most = min(worst, p), max(most, statistic)
     return Check(passed=worst >= P_LEAST, p=worst, values={"gain": most}, detail=detail)
@@ -447,7 +436,6 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
 _NEAR = 0.3  # relative, up to which a calibration may explain it
 _COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
-_EVEN = 0.02  # change of a known disturbance within a sample of a refit, over its size
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
 
