@@ -93,6 +93,25 @@ def test_a_resistance_that_the_means_contradict_is_named(r, passed):
         assert "offset" in check.detail
 
 
+def test_what_the_flux_took_up_is_no_part_of_the_resistance():
+    """A current that rises by half within 25 time constants of its coil, beside a position that sinks."""
+    i = carried()["current"].values + np.linspace(-0.25, 0.25, 4000)
+    x = 1e-3 * np.linspace(0.0, 1.0, 4000)
+    v = 4.0 * i + 0.6 * np.gradient(i) * RATE - 20.0 * np.gradient(x) * RATE
+    assert mean_resistance(record(v, i, x))[0] == pytest.approx(4.1, abs=0.02)
+    theta = {**THETA, "L": 0.6, "k_i": -20.0}
+    check = agreements(record(v, i, x), default_rig(), theta, SD, SD)["ohm"]
+    assert check.values["value"] == pytest.approx(4.0, abs=0.02)
+
+
+def test_a_current_of_another_run_does_not_belong():
+    own, other = carried(1), carried(2)
+    x = own["position"].values + 1e-8 * own["voltage"].values
+    check = belonging(record(own["voltage"].values, other["current"].values, x))
+    assert not check.passed
+    assert "relates the current to" in check.detail
+
+
 def test_positions_of_another_run_do_not_belong():
     own, other = carried(1), carried(2)
     assert belonging(own).passed

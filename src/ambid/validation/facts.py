@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
@@ -111,24 +112,26 @@ def _ohms(value: float, sd: float) -> str:
 
 
 def belonging(record: Record) -> Check:
-    """Check that position and current, or position and voltage, are related beyond chance."""
-    names = [name for name in ("current", "voltage") if name in record.names]
-    chance = {name: _chance(record["position"].values, record[name].values) for name in names}
-    passed = min(chance.values()) <= _CHANCE
+    """Check that each of position, current and voltage is related to another of them beyond chance."""
+    names = [name for name in ("position", "current", "voltage") if name in record.names]
+    chance = dict.fromkeys(names, 0.0)
+    if record.n_samples >= 4 * (_PAST + _LAGS):
+        white = {name: _whitened(record[name].values[:_LONGEST]) for name in names}
+        pairs = {pair: _chance(*(white[name] for name in pair)) for pair in combinations(names, 2)}
+        chance = {name: min(p for pair, p in pairs.items() if name in pair) for name in names}
+    alone = max(names, key=lambda name: chance[name])
+    passed = chance[alone] <= _CHANCE
+    others = " or ".join(name for name in names if name != alone)
     return Check(
-        passed=passed, p=min(chance.values()), cause="" if passed else "belonging",
+        passed=passed, p=chance[alone], cause="" if passed else "belonging",
         detail="position and current are of one run: they are related beyond chance" if passed
-        else f"nothing relates the position to {' or '.join(names)}, at any lag up to {_LAGS} samples: channels of "
+        else f"nothing relates the {alone} to {others}, at any lag up to {_LAGS} samples: channels of "
         "different runs, or shifted against each other. Take all columns from one run",
     )  # fmt: skip
 
 
-def _chance(a: Array, b: Array) -> float:
-    """Probability that two signals are related as much by chance."""
-    n = min(a.size, _LONGEST)
-    if n < 4 * (_PAST + _LAGS):
-        return 0.0
-    x, y = _whitened(a[:n]), _whitened(b[:n])
+def _chance(x: Array, y: Array) -> float:
+    """Probability that two whitened signals are related as much by chance."""
     size = float(np.sqrt((x @ x) * (y @ y)))
     if not size > 0.0:
         return 1.0
@@ -200,8 +203,11 @@ def agreements(
     force = abs(theta["k_i"]) > _SHOWN * sd.get("k_i", np.inf) and rig.parameter("k_i").role == "free"
     checks = {name: c for name, c in facts(record, rig, belongs=force).items() if name != "weight"}
     means = checks["ohm"].values
-    if means:
-        checks["ohm"] = ohm(record, theta["R"], alone.get("R", 0.0), means["value"], means["sd"])
+    if means:  # less what the flux took up from the first sample to the last
+        i, x = record["current"].values, record["position"].values
+        rise = theta["L"] * float(i[-1] - i[0]) + theta["k_i"] * float(x[-1] - x[0])
+        value = means["value"] - rise * record.rate_hz / float(i.sum())
+        checks["ohm"] = ohm(record, theta["R"], alone.get("R", 0.0), value, means["sd"])
     checks["sampling"] = sampling(theta, sd, record.rate_hz)
     return checks
 
