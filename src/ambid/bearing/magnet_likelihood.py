@@ -191,21 +191,23 @@ def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]
 
 
 def prior_rows(problem: BearingProblem, vector: Array) -> tuple[Array, Array]:
-    """Return the priors' `r` (n_priors,) and `J` (n_priors, size): those of numbers, and the weak one on log noise
-    levels.
+    """Return the priors' `r` (n_priors,) and `J` (n_priors, size): those of numbers, of positive ones log-normal, and
+    the weak one on log noise levels.
     """
     values, chain = problem.values(vector), problem.chain(vector)
     r, J = [], []
     for j, n in enumerate(problem.estimated):
+        if n.signed and np.isinf(n.prior_sd):
+            continue
         row = np.zeros(problem.size)
-        if np.isfinite(n.prior_sd):
+        if n.signed:
             r.append((values[n.name] - n.value) / n.prior_sd)
             row[j] = chain[j] / n.prior_sd
-            J.append(row)
-        elif not n.signed:
-            r.append((vector[j] - np.log(n.value)) / NOISE_PRIOR_SD)
-            row[j] = 1.0 / NOISE_PRIOR_SD
-            J.append(row)
+        else:  # of the logarithm: one in SI would let a positive number run to nothing
+            spread = min(n.prior_sd / n.value, NOISE_PRIOR_SD)
+            r.append((vector[j] - np.log(n.value)) / spread)
+            row[j] = 1.0 / spread
+        J.append(row)
     first = problem.noise_slices[0].start
     centre = problem.start()[first:]
     rows = np.zeros((centre.size, problem.size))

@@ -149,5 +149,7 @@ def test_priors_pull_with_their_own_weight(bench):
     vector[place] = np.log(1.6)
     r, J = prior_rows(with_prior, vector)
     row = int(np.argmax(np.abs(J[:, place])))
-    assert r[row] == pytest.approx(1.0)
-    assert J[row, place] == pytest.approx(16.0)
+    assert r[row] == pytest.approx(15.0 * np.log(1.6 / 1.5))
+    assert J[row, place] == pytest.approx(15.0)
+    vector[place] = np.log(1.5e-6)  # one in SI, (0 - 1.5) / 0.1, would pull no further from here on
+    assert prior_rows(with_prior, vector)[0][row] == pytest.approx(-15.0 * np.log(1e6))
