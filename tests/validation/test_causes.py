@@ -143,3 +143,75 @@ def test_a_model_is_extended_by_lines_between_the_frequencies_of_the_record_and_
     for name in ("m", "k_x", "k_i", "R", "L"):
         assert estimate[name].value == pytest.approx(clean[name].value, abs=2.0 * estimate[name].sd)
         assert estimate[name].sd < 2.0 * clean[name].sd
+
+
+UNITS = {"voltage": "V", "current": "A", "position": "m"}
+
+
+def dead_time(c, t):
+    c["voltage"] += 0.05 * c["voltage"].std() * np.sign(c["current"])
+
+
+def sensor_drift(c, t):
+    c["current"] += 0.2 * c["current"].std() * (t / t[-1]) ** 2
+
+
+def amplifier(c, t):
+    """What is logged is the command of an amplifier that follows it over three samples."""
+    v = c["voltage"]
+    c["voltage"] = v + 0.3 * (v - np.append(v[0], v[:-1]))
+
+
+@pytest.mark.parametrize("preset", ["thesis", "unstable-bearing"])
+@pytest.mark.parametrize(
+    ("spoil", "cause"), [(dead_time, "dead_time"), (sensor_drift, "slow_current"), (amplifier, "amplifier_lag")]
+)
+def test_what_the_amplifier_and_the_current_sensor_do_is_named(preset, spoil, cause):
+    columns, rate_hz = columns_of(preset, 1)
+    spoil(columns, np.arange(columns["voltage"].size) / rate_hz)
+    sure = strongest(columns, rate_hz)
+    assert cause in [c.name for c in sure if c.gain > 0.7 * sure[0].gain]
+
+
+def test_a_fixed_value_that_is_wrong_is_the_cause_and_what_it_moved_is_held():
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    rig = rig_of_preset(preset("unstable-bearing"))
+    truth = {p.name: p.value for p in rig.parameters}
+    free = {name: {"unit": unit} for name, unit in (("k_x", "N/m"), ("k_i", "N/A"), ("R", "ohm"), ("L", "H"))}
+    mass = {"m": {"value": 1.05 * truth["m"], "unit": "kg", "role": "fixed"}}
+    said = {"schema": "ambid.rig/1", "name": "heavier", "model": "one-axis", "parameters": mass | free}
+    estimate = ambid.identify(columns, said, rate_hz=rate_hz, units=UNITS)
+    reason = next(r for r in estimate.verdict.reasons if r.check == "causes")
+    assert reason.cause == "fixed_value"
+    assert reason.size == pytest.approx(-0.05 * truth["m"], rel=0.3)
+    assert not estimate.checks["fixed_agree"].passed
+    for name in free:
+        assert abs(estimate[name].value - truth[name]) < 4.0 * estimate[name].sd
+
+
+def test_a_force_whose_frequency_changes_is_named_by_its_band_and_taken_in():
+    rig = rig_of_preset(preset("unstable-bearing"))
+    clean = ambid.simulate(rig, duration=1.0, seed=1)
+    t = np.arange(clean.n_samples) / clean.rate_hz
+    columns = {c.name: c.values.copy() for c in clean.channels}
+    turn = 2 * np.pi * (60.0 * t + 1.5 * t**2)
+    columns["position"] = columns["position"] + 0.05 * columns["position"].std() * np.sin(turn)
+    sure = strongest(columns, clean.rate_hz)
+    assert sure[0].name in ("coloured_force", "coloured_voltage", "line")
+    assert sure[0].size == pytest.approx(61.5, abs=4.0)
+
+
+def test_a_line_whose_channel_is_not_clear_is_held_by_force_and_voltage():
+    """Two columns of waves in force and voltage hold a line of any channel: the numbers are those without it."""
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    clean = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+    t = np.arange(columns["voltage"].size) / rate_hz
+    for name, share in (("current", 0.2), ("position", 0.2)):
+        columns[name] = columns[name] + share * columns[name].std() * np.sin(2 * np.pi * 73.3 * t)
+    found = strongest(columns, rate_hz)
+    assert {part[0] for column in found[0].columns for part in column} == {"force", "voltage"}
+    estimate = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+    assert estimate.extended == ("line (73.3 Hz)",)
+    assert estimate.verdict.word == "usable"
+    for name in ("m", "k_x", "k_i", "R", "L"):
+        assert estimate[name].value == pytest.approx(clean[name].value, abs=2.0 * estimate[name].sd)

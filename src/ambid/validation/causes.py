@@ -22,7 +22,16 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
-from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, search, weight_of, workspace_near
+from ambid.estimation.likelihood import (
+    Fit,
+    free_one,
+    innovations,
+    residual_blocks,
+    run,
+    search,
+    weight_of,
+    workspace_near,
+)
 from ambid.estimation.linear import column_sizes, directions, periods_near, waves_at, without
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
@@ -36,19 +45,24 @@ _BLIND = 1e-12  # eigenvalue, over the largest, of directions that are not seen
 _SAME = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
 _WAVES = 8  # half waves over the record of a force or voltage that walks
 _MANY = 40  # and of one that was looked for because a check failed
-_SMOOTH = 9  # lines that are averaged to see a mode
+_SMOOTH = 9  # lines that are averaged to see a mode or a band
+_BAND = 10  # lines on either side of a band's middle
 _DAMPING = (0.005, 0.03)  # with which it is looked for
 _NARROW = 0.6  # part of the power around a line that its own three frequencies hold
 _LINES, _SKIRT = 6, 4  # lines that are taken together, and how far each reaches
+_CLEAR = 10.0  # power, of noise one, that no other channel of a line may leave less than, nor its own more
 _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
 _REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
 _PLAY = 0.1  # of the current's range: width of a hysteresis
-_SAME_COURSE = ("line", "slow_force", "slow_voltage")
+_SAME_COURSE = ("line", "slow_force", "slow_voltage", "slow_current", "coloured_force", "coloured_voltage")
 """Causes whose signals do not depend on the fit."""
 _IN_TIME = {*_SAME_COURSE, "r_drift"}
 """Causes that change in time, which no constant of the plant can imitate."""
-_GROWING = {*_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
+_GROWING = {
+    *_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature", "dead_time",
+    "friction", "amplifier_lag",
+}  # fmt: skip
 """Causes whose signals are known but for their sizes."""
 _GOES_ON = (
     0.01  # probability by chance, of waves that are faster, below which a walk goes on beyond those that were taken
@@ -131,19 +145,36 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     course, rate_hz = look.course, fit.problem.rate_hz
     spectra = _spectra(look.e @ look.weight.T)
     lines = _lines(look)
-    modes = _modes(spectra, rate_hz, lines) if thorough else ()
-    groups = list(_groups(course, modes, thorough=thorough))
+    top, chance = _top(spectra, lines) if thorough else (0, 1.0)
+    groups = list(_groups(course, top * rate_hz / course.t.size, thorough=thorough))
+    if chance < _LINE:
+        waves = [w for k in range(max(top - _BAND, 1), top + _BAND + 1) for w in waves_at(k, course.t.size).T[:2]]
+        groups += [(f"coloured_{way}", tuple(((way, w),) for w in waves)) for way in ("force", "voltage")]
     if delay_given:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
-    groups += [("line", columns) for columns in _waving(lines, course.t.size)]
+    groups += [("line", _waving(lines, course.t.size))] if lines else []
     found = _tested(look, groups)
+    at = top * rate_hz / course.t.size
+    found = [replace(c, size=at) if c.name.startswith("coloured") else c for c in found]
     if lines:
-        line = min((found.pop(), found.pop()), key=_net)
-        found.append(replace(line, size=lines[0].k * rate_hz / course.t.size, p=min(line.p, lines[0].p)))
+        line = found.pop()
+        at, p = lines[0].k * rate_hz / course.t.size, min(line.p, lines[0].p)
+        found.append(replace(line, channel=lines[0].channel, size=at, p=p))
+    found += _fixed(fit)
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
     return sorted(found, key=_net)
+
+
+def _fixed(fit: Fit) -> Iterator[Cause]:
+    """Yield each fixed value as a cause: what freeing it would gain, and move."""
+    for name in fit.problem.known:
+        gain, step = free_one(fit, name)
+        if gain > 0.0:
+            shift = step[:-1] * np.sqrt(max(1.0 - 1.0 / gain, 0.0))
+            p, size = chi_squared_tail(1, gain), step[-1:]
+            yield Cause(name="fixed_value", channel=name, gain=gain, p=p, size=float(size[0]), shift=shift, sizes=size)
 
 
 def _net(cause: Cause) -> float:
@@ -151,11 +182,9 @@ def _net(cause: Cause) -> float:
     return _PENALTY * cause.sizes.size - cause.gain
 
 
-def _waving(lines: Sequence[_Line], n: int) -> list[tuple[Column, ...]]:
-    """Return columns of lines, each in its channel, and each as a force and a voltage, as the loop's own source."""
-    waves = [(line.channel, w) for line in lines for w in waves_at(line.k, n).T]
-    both = tuple(((channel, w),) for _, w in waves for channel in ("force", "voltage"))
-    return [tuple(((channel, w),) for channel, w in waves), both] if lines else []
+def _waving(lines: Sequence[_Line], n: int) -> tuple[Column, ...]:
+    """Return columns of lines, each in its channels."""
+    return tuple(((channel, w),) for line in lines for channel in line.channels for w in waves_at(line.k, n).T)
 
 
 def extended(
@@ -176,7 +205,7 @@ def extended(
     error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
     information of the parameters is what is left beside the sizes.
     """
-    sure = [c for c in found if c.p < _CHANCE]
+    sure = [c for c in found if c.p < _CHANCE and c.name != "fixed_value"]
     if not sure or fit.problem.n_used > _LONGEST:
         return None
     cause = sure[0]
@@ -223,7 +252,7 @@ def _with_causes(
 
 def _goes_on(look: _Look, walk: Cause) -> bool:
     """Return whether a walk that a fit holds goes on beyond its waves, where it would pass for motion of the rotor."""
-    if walk.name not in ("slow_force", "slow_voltage"):
+    if not walk.name.startswith("slow"):
         return False
     count = len(walk.columns)
     beyond = _waves(look.course.t, max(2 * count, _MANY))[count:]
@@ -238,7 +267,9 @@ def _faster(walk: Cause, course: _Course) -> Cause:
 
 def told(cause: Cause) -> str:
     """Return a cause and its size, as what a model is extended by."""
-    unit = {"line": " Hz", "r_drift": " ohm", "sensor_lag": " s", "eddy_pole": " s", "current_sensor_pole": " s"}
+    unit = dict.fromkeys(("line", "coloured_force", "coloured_voltage"), " Hz")
+    unit |= dict.fromkeys(("sensor_lag", "eddy_pole", "current_sensor_pole"), " s")
+    unit |= {"r_drift": " ohm", "dead_time": " V", "friction": " N"}
     return f"{cause.name} ({cause.size:.3g}{unit[cause.name]})" if cause.name in unit else cause.name
 
 
@@ -247,7 +278,7 @@ def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
     if cause.name in _SAME_COURSE:
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
-    groups = _groups(course, (), thorough=False)
+    groups = _groups(course, 0.0, thorough=False)
     return next(columns for name, columns in groups if (name, columns[0][0][0], len(columns)) == own)
 
 
@@ -280,8 +311,8 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> _
     )  # fmt: skip
 
 
-def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[tuple[str, tuple[Column, ...]]]:
-    """Yield the causes with their signals; a size is that of the first. `modes`: frequencies, Hz."""
+def _groups(s: _Course, mode: float, *, thorough: bool) -> Iterator[tuple[str, tuple[Column, ...]]]:
+    """Yield the causes with their signals; a size is that of the first. `mode`: its frequency, Hz."""
     eddy = _rate(s.before, s.rate_hz)  # of the flux, where it shunts the coil; of the force alone
     yield "eddy_pole", ((("force", -s.theta["k_i"] * _rate(s.i, s.rate_hz)),), (("voltage", s.theta["L"] * eddy),))
     yield "sensor_lag", ((("position", -s.v),),)
@@ -289,23 +320,29 @@ def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[t
     yield "cross_talk", ((("position", s.i),), (("position", s.u_before),))
     yield "cross_talk", ((("current", s.x),), (("current", s.u_before),))
     yield "r_drift", ((("voltage", _between(-s.t * (s.i0 + s.i))),),)
-    waves = _waves(s.t, _WAVES)
-    yield "slow_force", tuple((("force", wave),) for wave in waves)
-    yield "slow_voltage", tuple((("voltage", wave),) for wave in waves)
+    yield "dead_time", ((("voltage", -_between(np.sign(s.i0 + s.i))),),)
+    yield "friction", ((("force", -_between(np.sign(s.v))),),)
+    step = np.append(0.0, s.u_before - s.u)
+    yield "amplifier_lag", tuple((("voltage", np.append(np.zeros(k), step[1:-k])),) for k in (1, 2))
+    for channel in ("force", "voltage", "current"):
+        yield f"slow_{channel}", tuple(((channel, wave),) for wave in _waves(s.t, _WAVES))
     for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
         yield "curvature", tuple(_curvature(s, degree))
     if not thorough:
         return
-    low, high = np.quantile(s.u, (1.0 - _REACH, _REACH))
-    ends = (np.maximum(s.u - high, 0.0), np.minimum(s.u - low, 0.0))
-    yield "limiter", tuple((("voltage", -end),) for end in ends)
+    yield "limiter", tuple((("voltage", -end),) for signal in (s.u, s.u - s.u_before) for end in _ends(signal))
     slack = _play(s.i, _PLAY * float(np.ptp(s.i))) - s.i
     flux = -s.theta["L"] * _rate(slack, s.rate_hz)
     yield "hysteresis", ((("force", s.theta["k_i"] * _between(slack)),), (("voltage", flux),))
     yield "slow_force", tuple((("force", wave),) for wave in _waves(s.t, _MANY))
-    for f in modes:
-        for damping in _DAMPING:
-            yield "flexible_mode", tuple((("position", q),) for q in _oscillation(s, f, damping))
+    for damping in _DAMPING:
+        yield "flexible_mode", tuple((("position", q),) for q in _oscillation(s, mode, damping))
+
+
+def _ends(signal: Array) -> tuple[Array, Array]:
+    """Return by how much a signal is beyond its outer tenths, above and below."""
+    low, high = np.quantile(signal, (1.0 - _REACH, _REACH))
+    return np.maximum(signal - high, 0.0), np.minimum(signal - low, 0.0)
 
 
 def _waves(t: Array, count: int) -> list[Array]:
@@ -488,7 +525,8 @@ def _ways(look: _Look, which: slice) -> dict[str, Complex]:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Line:
     k: float  # periods over the samples that are looked at
-    channel: str
+    channel: str  # that its direction tells best
+    channels: tuple[str, ...]  # that alone where it is clear, else force and voltage, which hold any
     p: float
 
 
@@ -499,7 +537,7 @@ def _lines(look: _Look) -> list[_Line]:
         spectra = _spectra(e)
         power, n_y = np.sum(np.abs(spectra) ** 2, axis=1), spectra.shape[1]
         median = float(np.median(power))
-        usual = median / (1.678 if n_y == 2 else np.log(2.0))  # of a sum of n_y unit exponentials
+        usual = _mean(median, n_y)
         power[: _WAVES // 2] = median  # what walks as slowly is no line
         j = int(np.argmax(power))
         ratio = float(power[j] / max(usual, 1e-300))
@@ -509,21 +547,32 @@ def _lines(look: _Look) -> list[_Line]:
             break
         ways = {name: way[0] for name, way in _ways(look, slice(j, j + 1)).items()}
         shares = {name: abs(np.vdot(way, spectra[j])) ** 2 / np.vdot(way, way).real for name, way in ways.items()}
-        channel = max(shares, key=lambda name: float(shares[name]))
-        k = periods_near(e @ ways[channel].conj(), j + 2)
-        lines.append(_Line(k=k, channel=channel, p=p))
+        first, second = sorted(shares, key=lambda name: -float(shares[name]))[:2]
+        left = float(np.vdot(spectra[j], spectra[j]).real) - float(shares[first])
+        clear = left < _CLEAR and float(shares[first] - shares[second]) > _CLEAR
+        k = periods_near(e @ ways[first].conj(), j + 2)
+        lines.append(_Line(k=k, channel=first, channels=(first,) if clear else ("force", "voltage"), p=p))
         e = without(e, waves_at(k, len(e)))
     return lines
 
 
-def _modes(spectra: Complex, rate_hz: float, lines: Sequence[_Line]) -> tuple[float, ...]:
-    """Return the frequency at which the innovations stand highest over some lines, Hz; not that of a line."""
-    power = np.sum(np.abs(spectra) ** 2, axis=1)
+def _top(spectra: Complex, lines: Sequence[_Line]) -> tuple[int, float]:
+    """Return where the innovations stand highest over some lines that are none of `lines`, in periods, and the
+    probability of that by chance: a Hann window leaves two of three lines independent.
+    """
+    power, n_y = np.sum(np.abs(spectra) ** 2, axis=1), spectra.shape[1]
+    median = float(np.median(power))
     for at in (round(line.k) - 2 for line in lines):
-        power[max(at - _SKIRT, 0) : at + _SKIRT + 1] = np.median(power)
+        power[max(at - _SKIRT, 0) : at + _SKIRT + 1] = median
     smooth = np.convolve(power, np.ones(_SMOOTH) / _SMOOTH, mode="same")
     smooth[: 2 * _SMOOTH] = 0.0
-    return (float((np.argmax(smooth) + 2) * 0.5 * rate_hz / (power.size + 2)),)
+    j, free = int(np.argmax(smooth)), round(4 * _SMOOTH * n_y / 3)
+    return j + 2, power.size * chi_squared_tail(free, free * float(smooth[j]) / max(_mean(median, n_y), 1e-300) / n_y)
+
+
+def _mean(median: float, n_y: int) -> float:
+    """Return the size of each of `n_y` exponentials whose sum has a median."""
+    return median / (1.678 if n_y == 2 else np.log(2.0))
 
 
 def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) -> Iterator[Cause]:
@@ -542,7 +591,10 @@ def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) ->
         )  # fmt: skip
 
 
-_SAME_AS = {"sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",)}
+_SAME_AS = {
+    "sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",), "coloured_force": ("line",),
+    "coloured_voltage": ("line",), "amplifier_lag": ("limiter", "current_sensor_pole"),
+}  # fmt: skip
 """What the first order of a score does not distinguish."""
 _TEXT = {
     "eddy_pole": "the force lags behind the current by {size:.3g} s: eddy currents. Excite more slowly, or identify "
@@ -553,8 +605,19 @@ _TEXT = {
     "cross_talk": "the {channel} holds a part of voltage or current: cross-talk. Check cables and grounds",
     "r_drift": "the resistance drifts by {size:.3g} ohm from the middle of the record to its end: the coil warms up. "
     "Record shorter, or after it is warm",
+    "dead_time": "the coil gets {size:.3g} V less than logged, against the direction of its current: dead time or the "
+    "drop of a diode. Compensate it, or log the coil's voltage",
+    "friction": "a force of {size:.3g} N acts against the motion, whatever its speed: dry friction. Free the rotor",
+    "coloured_force": "a force around {size:.4g} Hz changes in amplitude and phase: unbalance of changing speed, flow "
+    "or motion of the base. Remove its source, or excite beside it",
+    "coloured_voltage": "the voltage around {size:.4g} Hz changes in amplitude and phase. Check the amplifier's supply",
     "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
     "longer, or excite above it",
+    "slow_current": "the current's sensor drifts. Measure its zero before and after, or record shorter",
+    "amplifier_lag": "the coil's voltage follows the logged one late, as through a filter: an amplifier of small "
+    "bandwidth. Log the coil's voltage, or excite more slowly",
+    "fixed_value": "the fixed {channel} fits better {size:+.3g} (SI) from where it is: it is wrong, or a scale or the "
+    "rate is. Check it, or free it",
     "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",
     "curvature": "force or flux bends over this motion. Excite less, or identify the nonlinear magnet",
     "limiter": "the amplifier does not follow the logged voltage at its ends. Log the coil's voltage, or excite less",
@@ -596,8 +659,8 @@ def causes_check(
     if late is not None and not late.passed:
         others = tuple(c for c in dict.fromkeys([*others, late.cause, *late.alternatives]) if c != first.name)
     text = _TEXT[first.name].format(size=first.size, channel=first.channel)
-    if first.name == "line" and first.sizes.size > 4:
-        text += f"; {first.sizes.size // 4 - 1} more beside it"
+    if first.name == "line" and first.sizes.size > 8:
+        text += "; more beside it"
     if others:
         text += f"; about as well explained by {' or '.join(others)}"
     grave = checks["estimates_agree"].grave or (late is not None and not late.passed)
@@ -607,7 +670,7 @@ def causes_check(
         grave=grave, cause=first.name, size=first.size, alternatives=others,
     )  # fmt: skip
     fixed = checks["fixed_agree"]
-    if fixed.passed or fixed.values["gain"] - _PENALTY > net:
+    if fixed.passed or fixed.values["gain"] - _PENALTY >= net:
         return {"causes": named}
     text = f"a fixed value would fit better elsewhere, by less than {first.name} explains"
     return {"causes": named, "fixed_agree": replace(fixed, passed=True, detail=text)}
