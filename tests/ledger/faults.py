@@ -12,7 +12,7 @@ from ambid.ledger import History, watch
 from ambid.ledger.alarm import Alarm
 from ambid.ledger.history import Series
 from ambid.ledger.store import Failure
-from tests.ledger.simulated import BEGIN, YEARS, wandering
+from tests.ledger.simulated import BEGIN, VALUE, YEARS, wandering
 
 DAY = 86400.0
 HABITS = ("daily", "working days", "every third day", "weekly", "monthly", "irregular", "in bursts")
@@ -113,6 +113,15 @@ def ill(fault: str, name: str, rng: np.random.Generator) -> tuple[list[History],
             other[:], other[k], keep[k] = False, True, False
             slip = name[0] + name[2] + name[1] + name[3:]
             return [part(h, keep), replace(part(h, other), bearing=slip)], [], "name", slip
+        case "stored under another":
+            host = sound(f"{name} host", "daily", rng, shut=False)
+            scale = {x: 1.0 + 0.05 * rng.standard_normal() for x in VALUE}
+            series = {x: replace(s, value=scale[x] * s.value) for x, s in host.series.items()}
+            host = replace(host, series=series)
+            other = np.zeros(len(host.estimates), dtype=bool)
+            usable = [j for j, e in enumerate(host.estimates) if e.verdict == "usable"]
+            other[usable[len(usable) // 2]] = True
+            return [joined(h, part(host, other)), part(host, ~other)], [], "name", name
         case "doubled":
             other = np.zeros(n, dtype=bool)
             other[next(j for j in range(k, n) if h.estimates[j].verdict == "usable")] = True
@@ -127,7 +136,7 @@ def ill(fault: str, name: str, rng: np.random.Generator) -> tuple[list[History],
     return [part(h, keep, at)], [], "date", name
 
 
-FAULTS = ("gap", "late", "unusable", "failed", "wrong-named", "doubled", "wrong date")
+FAULTS = ("gap", "late", "unusable", "failed", "wrong-named", "stored under another", "doubled", "wrong date")
 
 
 def quiet_alarms(n: int, seed: int) -> tuple[Alarm, ...]:

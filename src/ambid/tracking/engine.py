@@ -17,7 +17,6 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
 from ambid.tracking.blocks import Block, Frame, Passed, Rejection, Stretch, paced
 from ambid.tracking.guard import StreamGuard
