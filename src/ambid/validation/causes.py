@@ -164,7 +164,8 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     found += _fixed(fit)
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
-    return sorted(found, key=_net)
+    found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
+    return [c for c in found if c.name != "slow_current" or c is found[0]]
 
 
 def _fixed(fit: Fit) -> Iterator[Cause]:
