@@ -96,8 +96,9 @@ class Evidence:
 def of_periods(fit: RotorFit) -> Evidence:
     """Return the evidence of period spectra."""
     found, numbers = refined(fit.problem, fit.vector, scores(fit.problem, fit.vector)), numbers_of(fit)
-    sd, more = {name: numbers.sd(name) for name in numbers.names}, beside(fit.problem, fit.vector, found)
-    agree, bent = agreement_checks(found, fit.model, more), curvature(fit.problem, fit.vector)
+    sd = {name: numbers.sd(name) for name in numbers.names}
+    more, second = beside(fit.problem, fit.vector, found)
+    agree, bent = agreement_checks(found, fit.model, second), curvature(fit.problem, fit.vector)
     named = next((c.cause for c in agree.values() if not c.passed), "")
     if bent and bent.shift and named and bent.gain < found[0].gain:  # no more than what is named does
         bent = bent.instead(named)

@@ -360,16 +360,18 @@ def suspects(found: Sequence[Score]) -> list[Score]:
     return [found[0], *_alike(found)] if found and abs(found[0].z) >= _FAR else []
 
 
-def beside(problem: Likelihood, v: Array, found: Sequence[Score]) -> list[Score]:
-    """Return the causes that explain most of what is left once the one that a check fails for is taken out."""
+def beside(problem: Likelihood, v: Array, found: Sequence[Score]) -> tuple[list[Score], list[Score]]:
+    """Return the causes that show once the one that a check fails for is taken out: all, and those to be named, which
+    explain most of what is left.
+    """
     if not suspects(found) or not np.isfinite(problem.cost(v - found[0].shift[: v.size])):
-        return []
+        return [], []
     first = found[0]
     v = v - first.shift[: v.size]
     freed, n = _without(problem, v, first.cause, first.size), problem.n_real
     found = suspects([s for s in scores(freed, v) if s.cause != first.cause])
     left = freed.cost(v) - n - 2.0 * np.sqrt(2.0 * n)  # beyond chance: what is taken out in part leaves a rest
-    return found if found and found[0].gain > _MAIN * left else []
+    return found, found if found and found[0].gain > _MAIN * left else []
 
 
 def _leads(s: Score) -> bool:
