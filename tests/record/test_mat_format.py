@@ -160,6 +160,26 @@ def test_a_text_of_octave_is_read_with_its_structs_and_ranges(tmp_path):
         read_record(path)
 
 
+def test_what_a_text_of_octave_holds_besides_leaves_other_variables_alone(tmp_path):
+    path, head = tmp_path / "a.mat", "# Created by Octave 9.2.0\n"
+    cube = "# name: cube\n# type: matrix\n# ndims: 3\n 2 2 2\n" + " 1\n" * 8 + "\n\n"
+    path.write_text(head + cube + octave("u", VOLTAGE[:, None]) + octave("fs", 2000.0, "scalar"))
+    np.testing.assert_array_equal(read_record(path)["u"], VOLTAGE)
+    with pytest.raises(RecordError, match="cube"):
+        read_record(path, variables={"x": ("cube", "m")})
+    path.write_text(head + "# name: c\n# type: cell\n# ndims: 3\n 1 1 1\n" + octave("u", VOLTAGE[:, None]))
+    with pytest.raises(RecordError, match="a size is missing"):
+        read_record(path)
+
+
+@pytest.mark.parametrize("numbers", ["0 1 0", "0 1e300 1e-9", "0 1e12 1", "0 inf 1", "0 nan 1"])
+def test_a_range_of_octave_that_the_file_cannot_mean_is_refused(tmp_path, numbers):
+    path, begin = tmp_path / "a.mat", "# name: t\n# type: double_range\n# base, limit, increment\n"
+    path.write_text(f"# Created by Octave 9.2.0\n{begin}{numbers}\n\n\n" + octave("u", VOLTAGE[:, None]))
+    with pytest.raises(RecordError, match=r"claims \d+ samples|no sound text of Octave"):
+        read_record(path)
+
+
 def test_a_matrix_of_outputs_stands_beside_the_vector_of_the_input(tmp_path):
     path = tmp_path / "a.mat"
     savemat(path, {"u": VOLTAGE, "y": BOTH, "OutputName": np.array(["pos", "cur"], object), "Ts": 1e-3})

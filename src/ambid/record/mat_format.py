@@ -214,7 +214,7 @@ def _content(path: Path, data: bytes) -> dict[str, Any]:
         return content_of_hdf5(path, matlab=True)
     if data.startswith(b"# Created by Octave"):
         with one_line(path, "no sound text of Octave", "Save it again, as save -v7"):
-            return dict(_octave(iter(data.decode().split("\n"))))
+            return dict(_octave(iter(data.decode().split("\n")), path, len(data)))
     from scipy.io import loadmat
 
     try:
@@ -251,34 +251,42 @@ def _fields(value: Any) -> Any:
     return value
 
 
-def _octave(lines: Iterator[str], most: float = math.inf) -> Iterator[tuple[str, Any]]:
-    """Yield the variables of a text that Octave saves where no format is told, structs as nested dicts."""
+def _octave(lines: Iterator[str], path: Path, size: int, most: float = math.inf) -> Iterator[tuple[str, Any]]:
+    """Yield the variables of a text that Octave saves where no format is told, structs as nested dicts; `size`: of the
+    file, in bytes.
+    """
 
     def numbers(count: int) -> Array:
         return np.array(" ".join(next(lines) for _ in range(count)).split(), dtype=np.float64)
 
     def sizes(count: int) -> list[int]:
-        said = (re.match(r"# (?:rows|columns|length|elements): (\d+)", x) for x in lines)
-        return [int(found[1]) for found in itertools.islice(filter(None, said), count)]
+        own = itertools.takewhile(lambda x: not x.startswith("# name: "), lines)
+        said = (re.match(r"# (?:rows|columns|length|elements): (\d+)", x) for x in own)
+        found = [int(x[1]) for x in itertools.islice(filter(None, said), count)]
+        if len(found) < count:
+            raise ValueError("a size is missing")
+        return found
 
     while most > 0 and (line := next((x for x in lines if x.startswith("# name: ")), "")):
         most, kind = most - 1, next(lines).removeprefix("# type: ").removeprefix("float ")
         value: Any = Foreign(kind)
         if kind == "scalar":
             value = numbers(1).reshape(1, 1)
-        elif kind == "matrix":
-            rows, columns = sizes(2)
-            value = numbers(rows).reshape(rows, columns)
+        elif kind == "matrix" and (rows := re.match(r"# rows: (\d+)", next(lines))):  # else of more dimensions
+            columns = sizes(1)[0]
+            value = numbers(int(rows[1])).reshape(int(rows[1]), columns)
         elif kind.endswith("range"):
-            base, limit, step = (next(lines), numbers(1))[1][:3]
-            value = base + step * np.arange(1 + np.floor((limit - base) / step + 1e-9))[None, :]
+            base, limit, step = (next(lines), numbers(1))[1][:3].tolist()
+            count = max(1 + math.floor((limit - base) / step + 1e-9), 0)  # ZeroDivisionError: refused
+            refuse_claim(path, count, 1, size)
+            value = base + step * np.arange(count)[None, :]
         elif kind == "string":
             value = [(next(lines), next(lines))[1] for _ in range(sizes(1)[0])]
             value = value[0] if len(value) == 1 else value
         elif kind == "cell":
-            value = [x for _, x in _octave(lines, math.prod(sizes(2)))]
+            value = [x for _, x in _octave(lines, path, size, math.prod(sizes(2)))]
         elif kind.endswith("struct"):
-            value = dict(_octave(lines, sizes(1)[0]))
+            value = dict(_octave(lines, path, size, sizes(1)[0]))
         yield line.removeprefix("# name: "), value
 
 
