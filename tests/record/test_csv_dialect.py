@@ -185,7 +185,7 @@ def test_a_temperature_called_t_is_not_the_time_where_another_column_is(tmp_path
         ("Abtastrate: 10'000 Hz", 10_000.0), ("Sample rate: 20 kS/s", 20_000.0), ("Sample rate: 20000 Sa/s", 20_000.0),
         ("# Sample rate (kHz) = 10", 10_000.0), ("# sampled at 10 kHz", 10_000.0), ("# dt [ms]: 0.1", 10_000.0),
         ("# fs: 10", None), ("fs = 20kHz", 20_000.0), ("Sample rate: 20k", None), ("Rate: 10", None),
-        ("Abtastrate: 10.000 Hz", None),
+        ("Abtastrate: 10.000 Hz", None), ("# Recorded at 2024", None), ("# logged at: 1000", None),
     ],
 )  # fmt: skip
 def test_a_rate_above_the_table_is_read_or_asked_for(tmp_path, line, rate):
@@ -282,6 +282,9 @@ def test_cells_that_name_themselves_are_columns(tmp_path):
         np.testing.assert_array_equal(record["x_mm"], [-0.1 * (k % 3) for k in range(20)])
     path.write_text("\n".join([*rows, "us:10007,u:"]))
     with pytest.raises(RecordError, match=r"row 21: its cells are not us:…, u:…, x_mm:…"):
+        read_record(path)
+    path.write_text("\n".join(["Ready", *rows[:19], "us:9507,u:1e999,x_mm:2"]))
+    with pytest.raises(RecordError, match=r"row 21, column 'u': '1e999' is not a finite number"):
         read_record(path)
     path.write_text("fs: 2000, gain: 3\n" + text([HEAD]))
     assert read_record(path).names == ("voltage", "position")

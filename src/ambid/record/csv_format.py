@@ -85,7 +85,9 @@ def table_of_lines(
     provenance: dict[str, str], told: Mapping[str, object],
 ) -> tuple[Table, float | None]:  # fmt: skip
     """Read a text, line by line; `told`: what its reading has told so far, for the history."""
-    lines = _labelled(_upright(lines), path)
+    upright = _upright(lines)
+    lines = _labelled(upright, path)
+    inserted = lines is not upright
     dialect = recognised(lines, path, layout)
     beside: Mapping[str, tuple[float, str | None]] = {}
     texts: Mapping[str, Sequence[str]] = {}
@@ -97,7 +99,8 @@ def table_of_lines(
             row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments, unit_texts=units
         )
         lines, told, beside, texts = dialect.lines, {**dialect.settings, **told}, dialect.beside, dialect.texts
-    values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
+    body, header = data_rows(lines, header.row, path, MIN_SAMPLES), replace(header, inserted=inserted)
+    values = read_values(body, header, path, gaps)
     if (long := pivoted(header.names, header.unit_texts, values, texts)) is not None:
         names, units, values = long
         header, told = replace(header, names=names, unit_texts=units), {**told, "long": True}
@@ -162,7 +165,7 @@ def table_of(
         names, units, values = (stamps[0], *names), ("s", *units), np.column_stack([stamps[1], values])
         clock, settings["time"] = Clock(column=0), f"{stamps[0]!r}, because it holds dates"
     table = Table(
-        where=str(path), names=names, unit_texts=units, values=values, first_row=header.row + 1,
+        where=str(path), names=names, unit_texts=units, values=values, first_row=header.first_row,
         time=clock.column, provenance=provenance, settings=settings,
     )  # fmt: skip
     return table, rate_hz
@@ -277,6 +280,12 @@ class Header:
     names: tuple[str, ...]
     unit_texts: tuple[str | None, ...]
     comments: tuple[str, ...]
+    inserted: bool = False  # it does not stand in the file
+
+    @property
+    def first_row(self) -> int:
+        """Line of the file in which the numbers begin."""
+        return self.row + (not self.inserted)
 
 
 def find_header(lines: Sequence[str], path: Path) -> Header:
@@ -375,7 +384,7 @@ def read_values(body: list[str], header: Header, path: Path, gaps: GapPolicy) ->
         block = body[start : start + _BLOCK]
         numbers = _sound_block(block, header)
         if numbers is None:
-            numbers = _cell_by_cell(block, header, header.row + 1 + start, path, gaps)
+            numbers = _cell_by_cell(block, header, header.first_row + start, path, gaps)
         values[start : start + len(block)] = numbers
     return values
 

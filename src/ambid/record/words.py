@@ -135,7 +135,7 @@ def rate_of(name: str, value: float, text: str | None = None) -> tuple[float, bo
     if ending and text is None and inside is None:
         called, inside = ending[1], {"hz": "Hz", "khz": "kHz"}.get(ending[2], ending[2])
     key, unit = re.sub(r"[^\w]|_(?!s\b)", "", called), unit_or_none(text or inside)
-    if not value > 0 or (unit is None and (text or inside)):
+    if not value > 0 or (unit is None and (text or inside or key.endswith("edat"))):  # recorded at 2024: no rate
         return None
     if _RATE.fullmatch(key) and (unit is None or unit.si == "Hz"):
         rate = value if unit is None else unit.to_si(value)
