@@ -51,6 +51,10 @@ def test_a_device_names_every_axis(rig, axes):
     assert "angle" in roles
 
 
+def test_a_device_says_whether_its_time_runs_with_the_host_s():
+    assert [RotorDevice(UTRC, pace=pace).info.real for pace in ("fastest", "real")] == [False, True]
+
+
 def test_a_rotor_that_touches_down_ends_the_run_with_its_sample():
     device = RotorDevice(UTRC)
     with device:

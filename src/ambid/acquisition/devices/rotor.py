@@ -48,6 +48,7 @@ class RotorDevice(PlayedDevice):
         shown = self._logged(self._off.advance(self._off.begun(), none, np.random.default_rng(0)), none)
         self._info = DeviceInfo(
             kind="simulated", port=truth.name or "rig", rate_hz=rate_hz, plant=self._levitated.plant.parameters,
+            real=pace == "real",
             columns=tuple(Column(name=c.name, role=roles.get(c.name, c.name), unit=c.unit) for c in shown),
         )  # fmt: skip
 
