@@ -55,6 +55,8 @@ def read_as_it_is(old):
         return
     before = Path(old).read_bytes()
     whole(old)
+    with open_ledger(old, write=False) as ledger, pytest.raises(AmbidError, match="readonly database"):
+        ledger.add([entry(3)])
     assert Path(old).read_bytes() == before
 
 

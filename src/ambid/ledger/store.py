@@ -285,7 +285,7 @@ class Ledger:
         Raises
         ------
         AmbidError
-            If there is no such bearing or record, or it is not clear which.
+            If there is no such kind, bearing or record, it is not clear which, or the time is no number.
         """
         with self._writing(alone=True) as c:
             return correcting.corrected(c, self.shown, kind, bearing, to, record, who=who, why=why)
@@ -608,6 +608,8 @@ def open_ledger(where: str | Path, *, write: bool = True, make: bool = True) -> 
                 ledger.close()
                 ledger = Ledger(copied_engine(Path(text)), name)
                 make_ready(ledger._engine, name, write=True, make=False)
+                with ledger._engine.connect() as c:
+                    c.exec_driver_sql("PRAGMA query_only = ON")  # what is written would be gone with the copy
     except BaseException:
         ledger.close()
         raise
