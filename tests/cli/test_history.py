@@ -124,6 +124,7 @@ def test_a_ledger_is_corrected_and_says_how_that_is_undone(demo, ambid, monkeypa
         (("A", "--why", "x"), "--why is for --rename, --redate, --remove, --undo"),
         (("A", "--rename", "B", "--json", "-"), "--json is not for --rename"),
         (("A", "--redate", "monday"), "--redate is 'monday'; it must be a date and time"),
+        (("A", "--redate", "", "--record", "day1.h5"), "it must be a date and time"),
         (("A", "--redate", "2026-01-01", "--record", "no.h5"), "--record no.h5: 'A' has no such record"),
         (("A", "--all", "--alarms", "usual"), "--all is not for --alarms"),
     ],

@@ -1,5 +1,6 @@
 """Corrections: names and times mended, records removed, what was before kept, undone, and held for later estimates."""
 
+import math
 import signal
 import subprocess
 import sys
@@ -147,6 +148,11 @@ def test_a_record_that_stands_there_already_is_told(ledger):
         (
             lambda x: x.correct("remove", "pmup 1", record="day3.h5"),
             "has no such record; it has day0.h5, day1.h5, day2.h5",
+        ),
+        (lambda x: x.correct("delete", "pump 1"), "kind is 'delete'; it is rename, redate, remove"),
+        *(
+            (lambda x, to=to: x.correct("redate", "pump 1", to, record="day2.h5"), "a time is a finite number")
+            for to in ("", "2026", math.nan, -math.inf)
         ),
         (lambda x: x.undo(7), "has no such correction; it has none"),
     ],

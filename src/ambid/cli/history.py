@@ -45,7 +45,7 @@ def _corrected(v: Values) -> bool:
         if change == "undo":
             done = ledger.undo(v.undo, **about)
         else:
-            to = {"rename": v.rename, "redate": moment(v.redate, "redate") if v.redate else ""}.get(change, "")
+            to = moment(v.redate, "redate") if change == "redate" else v.rename or ""
             done = ledger.correct(change, v.bearing, to, record=v.record, **about)
         typer.echo(f"{ledger.shown}: {done.text}. Undo: {command_of('history', ledger=ledger.shown, undo=done.number)}")
     return True

@@ -6,15 +6,16 @@ from __future__ import annotations
 
 import getpass
 import json
+import math
 import socket
 import time
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from ambid.errors import AmbidError, counted, listed, nearest
+from ambid.errors import AmbidError, choices, counted, listed, nearest
 from ambid.ledger.entry import ARCHIVED, OWN, REMOVED, Correction, day, tables
 from ambid.ledger.history import bearing_of
 from ambid.ledger.rows import assignments, bearing_numbers, chunks, copy_in, put
@@ -47,6 +48,10 @@ def corrected(
     c: Connection, ledger: str, kind: Kind, bearing: str, to: str | float, record: str | None, **about: str
 ) -> Correction:
     """Give a bearing, or one record of it, another name or time, or take it out of what is shown and judged."""
+    if kind not in get_args(Kind):
+        raise AmbidError(f"kind is {kind!r}; it is {choices(kind, get_args(Kind))} Correct it")
+    if kind == "redate" and (isinstance(to, str) or not math.isfinite(to)):
+        raise AmbidError(f"{setting('redate', repr(to))}: a time is a finite number, s since 1970. Give one")
     name = " ".join(str(to).split()) if kind == "rename" else REMOVED if kind == "remove" else bearing
     if not name:
         raise AmbidError(f"{setting('rename', repr(to))}: a bearing must have a name. Give one")

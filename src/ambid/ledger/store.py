@@ -285,7 +285,7 @@ class Ledger:
         Raises
         ------
         AmbidError
-            If there is no such kind, bearing or record, it is not clear which, or the time is no number.
+            If there is no such kind, bearing or record, it is not clear which, or the time is not finite.
         """
         with self._writing(alone=True) as c:
             return correcting.corrected(c, self.shown, kind, bearing, to, record, who=who, why=why)
