@@ -8,7 +8,7 @@ import pytest
 
 from ambid.errors import AmbidError
 from ambid.ledger import RecordRule, Rule, open_ledger, read_rules, watch, write_metrics
-from ambid.ledger.missing import pauses
+from ambid.ledger.missing import _still, alarm_of, pauses
 from ambid.ledger.silences import silences, take_note
 from ambid.ledger.store import Failure
 from ambid.ledger.telling import message
@@ -99,6 +99,15 @@ def test_a_bearing_that_failed_once_and_went_silent_is_told(ledger):
         for days in (91, 93)
     ]
     assert told == [[], ["never an estimate, and no record for 93 days; the last one failed: it has a gap"]]
+    state = next(s for s in look(ledger, failures=[failure]).states if s.bearing == "new")
+    assert (state.latest, state.heard, state.overdue_s) == (None, BEGIN, 92 * DAY)  # as the alarm has it
+
+
+@pytest.mark.parametrize("own", [[], [BEGIN], [BEGIN, BEGIN + 40 * DAY]], ids=["never", "open", "over"])
+def test_what_others_gave_in_a_pause_counts_whole_and_the_bearing_s_own_records_do_not(own):
+    others = [BEGIN + (k + 0.5) * DAY for k in (*range(-40, 0), 0)]
+    pause = alarm_of("new", "stale", BEGIN, BEGIN + 40 * DAY, "", raised=BEGIN + DAY)
+    assert _still(pause, np.sort([*others, *own])) == pytest.approx(39 * DAY)
 
 
 def test_metrics_and_messages_give_no_old_value_a_fresh_time(ledger, tmp_path):

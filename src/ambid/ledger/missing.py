@@ -266,13 +266,14 @@ def of_one_bearing(alarms: Iterable[Alarm], histories: Sequence[History]) -> Ite
 
 
 def _still(a: Alarm, every: Array) -> float:
-    """Return the longest time within a pause in which all bearings gave less than a tenth of what they had, s."""
+    """Return the longest time within a pause in which all bearings gave less than a tenth of what they had, s. The
+    records at its ends are its own.
+    """
     length = a.at_to - a.at_from
     edges = np.linspace(a.at_from, a.at_to, _PARTS + 1)
     before = float(np.diff(np.searchsorted(every, (a.at_from - length, a.at_from)))[0]) / _PARTS
     if before * _PARTS < _ENOUGH:
         return 0.0
-    counts = np.diff(np.searchsorted(every, edges, side="right"))
-    counts[0] -= 1  # its own
+    counts = np.diff([*np.searchsorted(every, edges[:-1], side="right"), np.searchsorted(every, a.at_to)])
     busy = np.flatnonzero(counts >= max(_ELSE * before, 1.0 if before > 1.0 else 0.5))
     return float(np.max(np.diff([-1, *busy, _PARTS])) - 1) * length / _PARTS

@@ -50,7 +50,8 @@ class Now:
     verdict: str  # of its latest estimate; "" where there is none
     latest: float | None  # estimate
     success: float | None  # the latest usable one
-    overdue_s: float  # after the latest estimate, from when the next one is overdue
+    heard: float | None  # the latest estimate, or failure where there never was one
+    overdue_s: float  # after that, from when the next one is overdue
     failures: int  # records without an estimate
 
 
@@ -164,11 +165,14 @@ def watch(
         if rule is not None:
             alarms += missing(h, rule, watched, failed.get(h.bearing, ()), now)
         states.append(_now(h, rule or RecordRule(), len(failed.pop(h.bearing, ())), now))
-    for name in sorted(failed):  # records of these never gave an estimate
-        n = len(failed[name])
-        states.append(Now(bearing=name, verdict="", latest=None, success=None, overdue_s=math.nan, failures=n))
-        if (rule := records.get(name, records.get(""))) is not None:
-            alarms += never(name, rule, failed[name], now)
+    for name, of in sorted(failed.items()):  # records of these never gave an estimate
+        rule, at = records.get(name, records.get("")), np.array(sorted(f.failed_at for f in of))
+        states.append(Now(
+            bearing=name, verdict="", latest=None, success=None, heard=float(at[-1]), failures=len(of),
+            overdue_s=pauses(at, rule or RecordRule()).overdue_s,
+        ))  # fmt: skip
+        if rule is not None:
+            alarms += never(name, rule, of, now)
     if records:
         alarms += misnamed(bearings, now)
         alarms = list(of_one_bearing(alarms, bearings))
@@ -186,8 +190,9 @@ def watch(
 def _now(h: History, rule: RecordRule, failures: int, now: float) -> Now:
     sound = [e for e in h.estimates if plausible(e, now)]
     success = [e.taken_at for e in sound if e.verdict != "unusable"]
+    latest = sound[-1].taken_at if sound else None
     return Now(
-        bearing=h.bearing, verdict=h.estimates[-1].verdict, latest=sound[-1].taken_at if sound else None,
+        bearing=h.bearing, verdict=h.estimates[-1].verdict, latest=latest, heard=latest,
         success=success[-1] if success else None, failures=failures,
         overdue_s=pauses(np.array([e.taken_at for e in sound]), rule).overdue_s,
     )  # fmt: skip

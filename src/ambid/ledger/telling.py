@@ -61,7 +61,8 @@ def write_metrics(watched: Watched, path: str | Path) -> None:
             verdict.labels(s.bearing, word).set(word == s.verdict)
         if s.latest is not None:
             taken.labels(s.bearing).set(s.latest)
-            overdue.labels(s.bearing).set(s.latest + s.overdue_s)
+        if s.heard is not None:
+            overdue.labels(s.bearing).set(s.heard + s.overdue_s)
         if s.success is not None:
             success.labels(s.bearing).set(s.success)
         for kind in KINDS if watched.records else ():
