@@ -445,6 +445,9 @@ def test_bad_gains_stop_it_when_it_lifts(tmp_path):
     done = ran(tmp_path, SimulatedDevice(rig), rig=rig, force=True)
     stopped_at("levitate", done, "safe state during levitation", "out_of_gap, position outside limits", "gains")
     assert files(tmp_path) == {"rig.toml", "commission.json", "report.html"}
+    (tmp_path / "rig.toml").unlink()
+    with pytest.raises(AmbidError, match=r"commission .* cannot be read: rig\.toml, .* does not lie beside it"):
+        load(tmp_path / "commission.json")
 
 
 def test_a_rotor_that_strays_stops_it(tmp_path):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self, Unpack
+from typing import Any, Unpack
 
 from ambid.acquisition.device import Device, DeviceInfo, Program
 from ambid.acquisition.review import loop_on, refuse_unstable
@@ -20,7 +20,7 @@ from ambid.acquisition.trials import VOLTAGE, Kept, Look, Room, Size, make_look
 from ambid.control.design import Design
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
-from ambid.estimation.estimate import Estimate, json_text, plain_json, read_as
+from ambid.estimation.estimate import Estimate, json_text, plain_json, read_as, read_whole
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
@@ -77,19 +77,27 @@ class Commissioned(Result):
     names: tuple[StepName, ...] = STEPS  # of all steps, those that were not reached too
 
     @classmethod
-    def of_file(cls, document: Mapping[str, Any], path: str) -> Self:
+    def of_file(cls, document: Mapping[str, Any], path: str) -> Commissioned:
         """Read ``commission.json`` and what stands beside it: the rig and, as far as it came, estimate and track."""
         folder = Path(path).parent
-        plan, device = read_as(Plan, document.get("wishes"), "wishes"), document.get("device")
+        if not (folder / "rig.toml").exists():
+            raise EstimationError(
+                f"commission {path} cannot be read: rig.toml, which it was made with, does not lie beside it. Copy it "
+                "there too"
+            )
 
         def beside(name: str) -> Any:
             return load_result(folder / name) if (folder / name).exists() else None
 
-        return cls(
-            steps=read_as(tuple[Step, ...], document.get("steps"), "steps"), estimate=beside("estimate.json"),
-            track=beside("track.jsonl"), folder=folder, rig=load_rig(folder / "rig.toml"), plan=plan, names=plan.steps,
-            device=read_as(DeviceInfo, device and {**device, "columns": []}, "device"),
-        )  # fmt: skip
+        def read() -> Commissioned:
+            plan, device = read_as(Plan, document.get("wishes"), "wishes"), document.get("device")
+            return cls(
+                steps=read_as(tuple[Step, ...], document.get("steps"), "steps"), estimate=beside("estimate.json"),
+                track=beside("track.jsonl"), folder=folder, rig=load_rig(folder / "rig.toml"), plan=plan,
+                device=read_as(DeviceInfo, device and {**device, "columns": []}, "device"), names=plan.steps,
+            )  # fmt: skip
+
+        return read_whole(read, f"commission {path}", "commission", "commission")
 
     @property
     def reasons(self) -> tuple[Reason, ...]:

@@ -126,11 +126,9 @@ def _whole(module: str, name: str, job: str) -> Callable[[Mapping[str, Any], str
 
     def read(document: Mapping[str, Any], path: str) -> Any:
         kind = getattr(import_module(f"ambid.{module}"), name)
-        read_beside = getattr(kind, "of_file", None)
-        return read_whole(
-            lambda: read_as(kind, document) if read_beside is None else read_beside(document, path),
-            f"{name.lower()} {path}", name.lower(), job,
-        )  # fmt: skip
+        if hasattr(kind, "of_file"):
+            return kind.of_file(document, path)
+        return read_whole(lambda: read_as(kind, document), f"{name.lower()} {path}", name.lower(), job)
 
     return read
 
