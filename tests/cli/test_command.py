@@ -35,6 +35,7 @@ USAGE = {
         ["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--nonlinear"],
         "has no [magnet]; a nonlinear simulation needs one",
     ),
+    "a verb of a release before": (["fleet", "simulate", "--help"], "Give records of 'ambid simulate' to 'ambid fleet"),
     "metrics without alarms": (["history", "--ledger", "x.db", "--publish", "a.prom"], "--publish needs --alarms"),
     "rig without rate": (["simulate", "rig.toml", "-o", "x.csv"], "Give --rate HZ"),
     "rig without values": (["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--amplitude", "1"], "no value"),

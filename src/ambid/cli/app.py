@@ -57,7 +57,8 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig",
         "export": "'ambid export ESTIMATE.json -o FILE', of what --json ESTIMATE.json wrote",
     },
-    "console": {"key": "--certificate CERT,KEY"}, "export": {"to": "--library"},
+    "console": dict.fromkeys(("key", "certificate", "listen"), "'ssh -L', which forwards the port"),
+    "export": {"to": "--library"},
     "init": {"plot": "'ambid info RECORD --plot FILE.png'"},
     "history": {"export": "", "tables": "", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
     "design controller": {"method": "--kind", "export": "--law", "judges": ""}, "design experiment": {"lines": ""},
@@ -144,7 +145,9 @@ def run_verb(words: Sequence[str]) -> int:
 
 
 def _refuse_former(words: Sequence[str]) -> None:
-    """Refuse an option of a release before, and say what it is now."""
+    """Refuse an option or a verb of a release before, and say what it is now."""
+    if list(words[:2]) == ["fleet", "simulate"]:
+        raise AmbidError("'ambid fleet simulate' is gone. Give records of 'ambid simulate' to 'ambid fleet run'")
     job = next((name for name in (" ".join(words[:2]), *words[:1]) if name in _FORMER), "")
     for word in words if job else ():
         new = _FORMER[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
