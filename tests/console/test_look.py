@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ambid.console.envelope import window
 from ambid.console.look import limits, look
 from ambid.errors import AmbidError
 from ambid.record import Channel, Record
@@ -23,6 +24,11 @@ def ramp(n=20_000):
     t = np.arange(n) / RATE
     turns = 10.0 + 5.0 * t
     return record_of(position=3e-6 * np.sin(2.0 * np.pi * (10.0 * t + 2.5 * t**2)), speed=2.0 * np.pi * turns)
+
+
+def test_a_window_that_is_kept_for_all_is_written_by_nobody():
+    with pytest.raises(ValueError, match="read-only"):
+        window(16)[0] = 1.0
 
 
 @pytest.mark.parametrize(("weights", "low"), [("flat top", 0.002), ("Hann", 0.16)])

@@ -194,7 +194,9 @@ def window(n: int, weights: str = "Hann") -> Array:
     """Return a window (n,) over whole periods."""
     phase = 2.0 * np.pi * np.arange(n) / n
     terms = np.array([(-1) ** k * a * np.cos(k * phase) for k, a in enumerate(WINDOWS[weights][0])])
-    return np.asarray(terms.sum(axis=0))
+    shape = np.asarray(terms.sum(axis=0))
+    shape.flags.writeable = False  # it is kept for all who ask
+    return shape
 
 
 def spectrum(

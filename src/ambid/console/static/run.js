@@ -19,7 +19,7 @@ export function listen(id, told, envelope = () => {}, gone = () => {}) {
   };
   proven(path).then((address) => {
     if (left) return;
-    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${address}&page=${PAGE}`);
+    socket = new WebSocket(`ws://${location.host}${address}&page=${PAGE}`);
     socket.binaryType = "arraybuffer";
     socket.onmessage = hear;
     socket.onclose = () => {
