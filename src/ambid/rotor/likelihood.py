@@ -61,9 +61,8 @@ class Noise:
     12).
     """
 
-    levels: (
-        Array  # (n_parts,): variance of one period's spectrum: white ones of sensors, of disturbances, then coloured
-    )
+    # (n_parts,): variance of one period's spectrum: white ones of sensors, of disturbances, then coloured
+    levels: Array
     colours: tuple[tuple[int, float], ...]  # source and w_p, rad/s, of each coloured part
     covariance: Complex  # (n_lines, n_y, n_y) at the excited lines, of one period
 
