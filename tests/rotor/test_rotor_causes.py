@@ -18,7 +18,7 @@ from ambid.rig import Rig, rig_of_preset
 from ambid.rig.rotor import RigModes
 from ambid.rotor.conclusion import shifts_of
 from ambid.rotor.estimator import estimate_rotor, unknowns_at
-from ambid.rotor.likelihood import Experiment
+from ambid.rotor.likelihood import Experiment, Point, fit_noise, sampled
 from ambid.rotor.lines import Line, apart
 from ambid.rotor.scores import Cause, Score, agreement_checks, scored
 from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
@@ -86,15 +86,36 @@ def test_two_planes_a_little_off_are_named_and_no_mode_stands_in_for_them() -> N
     assert {"A.z_sensor", "B.z"} & {check.cause, *check.alternatives}
 
 
-def test_coloured_noise_is_no_mode_and_leaves_numbers_usable(sound: Any) -> None:
-    record, rig = sound
-    rng, pole = np.random.default_rng(1), np.exp(-2 * np.pi * 10.0 / record.rate_hz)
+def coloured(record: Record, hertz: float) -> Record:
+    """The record with 2 um rms of noise below a frequency in two positions."""
+    rng, pole = np.random.default_rng(1), np.exp(-2 * np.pi * hertz / record.rate_hz)
 
     def noisy(x: Any) -> Any:
         slow = lfilter([1.0], [1.0, -pole], rng.standard_normal(x.size))
         return x + 2e-6 * slow / slow.std()
 
-    found = ambid.identify(changed(record, ax_position=noisy, by_position=noisy), rig)
+    return changed(record, ax_position=noisy, by_position=noisy)
+
+
+def test_noise_is_coloured_in_any_unit_of_the_outputs(sound: Any) -> None:
+    unit, record, rig = 1e6, coloured(sound[0], 30.0), sound[1]
+    model, theta = model_of(replace(truth.BENCHES["rigid"], period=0.25))
+    excitation = find_excitation(record, rig.plant)
+    assert excitation is not None
+    of = Experiment(spectra=period_spectra(record, model, excitation), speed=0.0)
+    at = Point(theta=theta, delays=np.ones(len(model.inputs)))
+    beside, response = of.spectra.between, [sampled(of, model, at, between=x) for x in (True, False)]
+    larger = [replace(x, space=replace(x.space, C=unit * x.space.C)) for x in response]
+    plain = fit_noise(beside, *response)
+    scaled = fit_noise(replace(beside, Y=unit * beside.Y), *larger)
+    assert {0, 3} <= {j for j, _ in plain.colours}
+    assert scaled.colours == plain.colours
+    assert scaled.covariance == pytest.approx(unit**2 * plain.covariance, rel=1e-3)
+
+
+def test_coloured_noise_is_no_mode_and_leaves_numbers_usable(sound: Any) -> None:
+    record, rig = sound
+    found = ambid.identify(coloured(record, 10.0), rig)
     assert found.verdict.word == "usable", found.verdict.reasons
     assert not found.modes
     assert found.noise["ax_position"] > 2.0 * found.noise["ay_position"]

@@ -153,10 +153,11 @@ def _colours_asked(
     poles = np.geomspace(order[_COLOURED_LINES], order[-1], _POLES)
     _, low = _parts(omega, 0, [(0, x) for x in poles.tolist()])
     power, products = _seen(g, e, _of_sources(levels, of, shape))
-    own, inverse, asked = np.sqrt(np.einsum("kss->ks", products)), np.linalg.pinv(information, rcond=1e-9), []
+    own, asked = np.sqrt(np.einsum("kss->ks", products)), []
+    inverse = np.linalg.pinv(information * np.outer(levels, levels), rcond=1e-9)  # of logarithms, which have no unit
     for j in range(g.shape[2]):
         score = low.T @ (np.minimum(power[:, j], _CLIPPED * own[:, j]) - own[:, j])
-        cross = low.T @ (products[:, j][:, of] * shape)
+        cross = low.T @ (products[:, j][:, of] * shape * levels)
         left = (low**2).T @ products[:, j, j] - np.einsum("cp,pq,cq->c", cross, inverse, cross)
         z = score / np.sqrt(np.maximum(left, _OWN_PART * ((low**2).T @ products[:, j, j])))
         k = int(np.argmax(z))
