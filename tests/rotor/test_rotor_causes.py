@@ -20,8 +20,9 @@ from ambid.rotor.conclusion import shifts_of
 from ambid.rotor.estimator import estimate_rotor, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point, fit_noise, sampled
 from ambid.rotor.lines import Line, apart
+from ambid.rotor.response import Sampled
 from ambid.rotor.scores import Cause, Score, agreement_checks, scored
-from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
+from ambid.rotor.spectra import Between, find_excitation, find_slip, period_spectra
 from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -97,14 +98,28 @@ def coloured(record: Record, hertz: float) -> Record:
     return changed(record, ax_position=noisy, by_position=noisy)
 
 
-def test_noise_is_coloured_in_any_unit_of_the_outputs(sound: Any) -> None:
-    unit, record, rig = 1e6, coloured(sound[0], 30.0), sound[1]
+def between(sound: Any, hertz: float) -> tuple[Between, list[Sampled]]:
+    """Spectra of coloured noise between the lines, and the true model there and at the lines."""
     model, theta = model_of(replace(truth.BENCHES["rigid"], period=0.25))
-    excitation = find_excitation(record, rig.plant)
+    record = coloured(sound[0], hertz)
+    excitation = find_excitation(record, sound[1].plant)
     assert excitation is not None
     of = Experiment(spectra=period_spectra(record, model, excitation), speed=0.0)
     at = Point(theta=theta, delays=np.ones(len(model.inputs)))
-    beside, response = of.spectra.between, [sampled(of, model, at, between=x) for x in (True, False)]
+    return of.spectra.between, [sampled(of, model, at, between=x) for x in (True, False)]
+
+
+@pytest.mark.parametrize("hertz", [30.0, 100.0])
+def test_the_rms_of_coloured_noise_is_that_of_its_samples(sound: Any, hertz: float) -> None:
+    """The excited lines end at a fifth of half the rate."""
+    beside, response = between(sound, hertz)
+    rms = fit_noise(beside, *response).sd(2500, sound[0].rate_hz)[:4]
+    slow = np.hypot(2e-6, 2e-7)
+    assert rms == pytest.approx(np.array([slow, 2e-7, 2e-7, slow]), rel=0.15)
+
+
+def test_noise_is_coloured_in_any_unit_of_the_outputs(sound: Any) -> None:
+    unit, (beside, response) = 1e6, between(sound, 30.0)
     larger = [replace(x, space=replace(x.space, C=unit * x.space.C)) for x in response]
     plain = fit_noise(beside, *response)
     scaled = fit_noise(replace(beside, Y=unit * beside.Y), *larger)

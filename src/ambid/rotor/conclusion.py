@@ -244,7 +244,7 @@ def _noise(fit: RotorFit) -> dict[str, float]:
     """Return the rms of every source in the first experiment."""
     weight, experiment = fit.problem.weights[0], fit.problem.experiments[0]
     assert weight.noise is not None
-    sd = weight.noise.sd(experiment.spectra.period, experiment.spectra.omega)
+    sd = weight.noise.sd(experiment.spectra.period, experiment.spectra.rate_hz)
     return dict(zip((*fit.model.outputs, *fit.model.disturbances), sd.tolist(), strict=True))
 
 

@@ -70,8 +70,9 @@ class Noise:
         """Return the variance of each source at angular frequencies, (n_lines, n_sources)."""
         return _of_sources(self.levels, *_parts(omega, self.levels.size - len(self.colours), self.colours))
 
-    def sd(self, period: int, omega: Array) -> Array:
-        """Return the rms of each source in samples of SI units, by its mean over angular frequencies."""
+    def sd(self, period: int, rate_hz: float) -> Array:
+        """Return the rms of each source in samples of SI units: its lines of a period up to half the rate, summed."""
+        omega = 2.0 * np.pi * rate_hz * np.arange(1, period // 2 + 1) / period
         return np.asarray(np.sqrt(self.at(omega).mean(axis=0) * period))
 
 
