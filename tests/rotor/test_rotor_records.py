@@ -88,3 +88,11 @@ def test_axes_that_nothing_moves_are_refused_by_name() -> None:
     bench = _bench("rigid", excited=(0, 2))
     with pytest.raises(EstimationError, match="ay, by move no more than their noise"):
         ambid.identify(record_of(bench, 1), free_rig(bench))
+
+
+def test_periods_that_are_exactly_alike_are_not_usable_and_raise_no_warning() -> None:
+    bench = _bench("rigid")
+    record = record_of(bench, 1)
+    period = round(bench.period * record.rate_hz)
+    alike = [replace(c, values=np.resize(c.values[:period], record.n_samples)) for c in record.channels]
+    assert ambid.identify(replace(record, channels=tuple(alike)), free_rig(bench)).verdict.word == "unusable"

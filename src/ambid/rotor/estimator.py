@@ -35,6 +35,7 @@ _CLEAR = 0.5  # part of the residuals that a mode explains, from which no sensor
 _FAR_ABOVE = 2.0
 _BESIDE = 1.05  # how far a mode may stand from where the rig says, or from the highest line
 _LEAST_LINES = 24
+_NO_NOISE = 1e-200  # variance below that of any noise, so that none is no division by 0
 _MOVES = 1.5  # power of a position at the excited lines, over that of its noise, from which it is moved
 _MOST_MODES = 9
 _WHOLE = 1e-4  # samples by which a delay may miss a whole number however exact it is: R hardly moves by that
@@ -409,7 +410,8 @@ def _idle(experiments: Sequence[Experiment], model: RotorModel) -> list[str]:
     if any(model.at_speed(e.speed).turning for e in experiments):
         return []
     spectra = [e.spectra for e in experiments]
-    over = np.max([np.mean(np.abs(s.mean_y) ** 2 / s.scatter[1], axis=0) * s.n_periods for s in spectra], axis=0)
+    noise = [np.maximum(s.scatter[1], _NO_NOISE) / s.n_periods for s in spectra]
+    over = np.max([np.mean(np.abs(s.mean_y) ** 2 / n, axis=0) for s, n in zip(spectra, noise, strict=True)], axis=0)
     plane = np.array([p for _, p in model.placed])
     moved = {int(plane[j]) for k, (j, _) in enumerate(model.sensors) if over[k] > _MOVES}
     return [axis for axis, p in zip(model.axes, plane, strict=True) if p not in moved] if moved else []
