@@ -344,7 +344,7 @@ def agreement_checks(found: Sequence[Score], model: RotorModel, more: Sequence[S
         checks[name] = Check(
             passed=passed, values={"z": worst.z, "size": worst.size}, detail=detail,
             cause="" if passed else worst.cause.name, size=None if passed else worst.size,
-            alternatives=() if passed else tuple(dict.fromkeys([*others, *(s.cause.name for s in more)])),
+            alternatives=() if passed else tuple(dict.fromkeys(others)),
         )  # fmt: skip
     return checks
 
