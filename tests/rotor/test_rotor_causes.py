@@ -21,7 +21,7 @@ from ambid.rotor.estimator import estimate_rotor, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point, fit_noise, sampled
 from ambid.rotor.lines import Line, apart
 from ambid.rotor.response import Sampled
-from ambid.rotor.scores import Cause, Score, agreement_checks, scored
+from ambid.rotor.scores import Bent, Cause, Score, agreement_checks, curvature_check, scored
 from ambid.rotor.spectra import Between, find_excitation, find_slip, period_spectra
 from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
@@ -144,6 +144,14 @@ def test_a_reversed_position_is_not_blamed_on_the_magnets(sound: Any) -> None:
     assert found.verdict.word == "unusable"
     assert found.checks["curvature"].passed
     assert "something else is wrong" in found.checks["curvature"].detail
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_curvature_that_moves_numbers_passes_only_where_another_check_fails(told: bool) -> None:
+    bent = Bent(gain=100.0, p=1e-9, shift={"m": 1.0}, more=np.ones((1, 1)), share=0.3)
+    check = curvature_check(bent, {"m": 0.1}, told=told)
+    assert (check.passed, check.cause, check.values) == (told, "", {"z": 10.0})
+    assert "move m by 10 sd of the record: something else is wrong" in check.detail
 
 
 def test_two_faults_at_once_are_both_named_and_in_the_intervals(sound: Any) -> None:

@@ -102,6 +102,8 @@ def of_periods(fit: RotorFit) -> Evidence:
     named = next((c.cause for c in agree.values() if not c.passed), "")
     if bent and bent.shift and named and bent.gain < found[0].gain:  # no more than what is named does
         bent = bent.instead(named)
+    residual = _residual_checks(fit)
+    told = not all(c.passed for c in (*residual.values(), *agree.values()))
     return Evidence(
         method="periods",
         noise=_noise(fit),
@@ -109,8 +111,8 @@ def of_periods(fit: RotorFit) -> Evidence:
         bent=bent,
         shifts=[*shifts_of(fit, found), *shifts_of(fit, more)],
         checks={
-            **_residual_checks(fit),
-            **({"curvature": curvature_check(bent, sd)} if bent else {}),
+            **residual,
+            **({"curvature": curvature_check(bent, sd, told=told)} if bent else {}),
             **agree,
         },
     )

@@ -532,8 +532,8 @@ def _powers(s: Array) -> tuple[list[Array], float]:
     return [(s / size) ** k for k in range(_DEGREE + 1)], size
 
 
-def curvature_check(bent: Bent, sd: Mapping[str, float]) -> Check:
-    """Judge what curvature has done against the standard deviations of the record."""
+def curvature_check(bent: Bent, sd: Mapping[str, float], *, told: bool) -> Check:
+    """Judge what curvature has done against the standard deviations of the record; `told`: another check fails."""
     worst = max(bent.shift, key=lambda x: abs(bent.shift[x]) / (sd.get(x) or np.inf), default="")
     z = abs(bent.shift[worst]) / (sd.get(worst) or np.inf) if worst else 0.0
     if bent.other:
@@ -541,9 +541,10 @@ def curvature_check(bent: Bent, sd: Mapping[str, float]) -> Check:
         return Check(passed=True, p=bent.p, detail=text)
     if bent.share < _MAIN and z > _BENT:
         text = (
-            f"curvature of the magnets would explain {bent.share:.0%} of what the model leaves: something else is wrong"
+            f"curvature of the magnets would explain {bent.share:.0%} of what the model leaves, and move {worst} by "
+            f"{z:.2g} sd of the record: something else is wrong"
         )
-        return Check(passed=True, p=bent.p, values={"z": z}, detail=text)
+        return Check(passed=told, p=bent.p, values={"z": z}, detail=text)
     if z <= _HARMLESS:
         return Check(passed=True, p=bent.p, detail="no curvature of the magnets shows that moves a number")
     held = z <= _BENT
