@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ambid.record import write_record
+from ambid.recursive.lines import Event
 from processes import command, watched
 from table import Table
 from timing import quantity
@@ -57,13 +58,14 @@ def followed(bench: TrackBench, seed: int) -> Followed:
     """Track one record through its change."""
     samples = bench.samples("change", seed, LENGTH_S, AT_S)
     begin = round(START_S * RATE)
-    supervisor = supervised(identified(samples), first=begin)
+    events: list[Event] = []
+    supervisor = supervised(identified(samples), first=begin, listener=events.append)
     times, values = [], []
     for k, part in blocks(samples, begin):
         supervisor.feed(part, k)
         times.append((k + part.y.shape[0]) / RATE)
         values.append(supervisor.parameters["k_i"].value)
-    alarms = [e for e in supervisor.log.events if e.kind in ("change", "disturbed") and "detected" in e.values]
+    alarms = [e for e in events if e.kind in ("change", "disturbed") and "detected" in e.values]
     after = [e for e in alarms if e.values["detected"] > AT_S]
     named = [e.parameter for e in after if e.kind == "change"]
     return Followed(
