@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.estimation.likelihood import linearise as off_line
-from ambid.tracking.evidence import EvidenceStream, Samples, linearise
+from ambid.tracking.evidence import EvidenceStream, RecentSamples, Samples, linearise
 from ambid.tracking.numbers import tracked_numbers
 from tests.tracking.starts import bearing, bearing_start, columns
 
@@ -117,3 +117,21 @@ def test_a_bad_sample_ends_a_feed_and_a_restart_drops_the_block(numbers):
     assert stream.close(100) is None
     used, _, _ = stream.feed(Samples(u=u, y=y).part(701, 710))
     assert (used, stream.settling) == (9, stream.settling_samples - 9)
+
+
+def test_recent_samples_stay_in_one_piece():
+    """As they come one by one, and in blocks that are longer than what is kept."""
+    values, rng = np.arange(2000.0), np.random.default_rng(0)
+    for sizes in ([1] * 400, rng.integers(0, 30, 60), [3, 95, 7, 41, 40, 200, 1]):
+        recent, last = RecentSamples(20), 0
+        for n in sizes:
+            part = values[last : last + n, None]
+            last += int(n)
+            recent.add(Samples(u=part, y=-part), last)
+            kept = recent.since(recent.first)
+            assert last - recent.first >= min(20, last)
+            assert kept is None if last == 0 else np.array_equal(kept.u[:, 0], values[recent.first : last])
+        assert np.shares_memory(recent.since(last - 9).y, recent.since(last - 1).y)  # a search has no time to copy
+        assert np.array_equal(recent.since(last - 3).y[:, 0], -values[last - 3 : last])
+        recent.clear()
+        assert recent.since(last - 1) is None

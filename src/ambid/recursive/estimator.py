@@ -132,7 +132,10 @@ def _fits(values: Array, n: int, width: int) -> bool:
 
 def _rows(values: Array, n: int, width: int) -> Array:
     """Return values as (n, width): for arrays of another kind the recursions would be compiled again."""
-    return np.require(values.reshape(n, width), np.float64, ["C", "W"])
+    rows = values.reshape(n, width)
+    if rows.dtype == np.float64 and rows.flags.carray:  # what follows takes as long as the use of one sample
+        return rows
+    return np.require(rows, np.float64, ["C", "W"])
 
 
 def check_channels(name: str, rate_hz: float, channels: int) -> None:

@@ -6,9 +6,7 @@ if the model is right. QR of [Ψ e] leaves J, r: -2 log-likelihood = rest + |r +
 
 from __future__ import annotations
 
-import copy
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,34 +39,38 @@ class RecentSamples:
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
-        self._parts: deque[Samples] = deque()
-        self.first = self.last = 0  # number of the oldest sample that is kept, and that after the newest
+        self._parts: list[Array] = []  # of twice the capacity, filled from the front: parts of one sample are many
+        self._filled = self.last = 0  # `last`: number of the sample after the newest
+
+    @property
+    def first(self) -> int:
+        """Number of the oldest sample that is kept."""
+        return self.last - self._filled
 
     def add(self, samples: Samples, last: int) -> None:
         """Keep more samples. `samples`: those that follow the ones before; `last`: number of the sample after them."""
-        self.last = last
+        columns = [x for x in (samples.u, samples.y, samples.forcing) if x is not None]
+        n, room, filled = samples.y.shape[0], 2 * self._capacity, self._filled
         if not self._parts:
-            self.first = last - samples.y.shape[0]
-        self._parts.append(copy.deepcopy(samples))
-        while self.last - self.first - (oldest := self._parts[0].y.shape[0]) >= self._capacity:
-            self._parts.popleft()
-            self.first += oldest
+            self._parts = [np.empty((room, x.shape[1])) for x in columns]
+        keep = filled if filled + n <= room else min(filled, max(self._capacity - n, 0))
+        self._filled, self.last = min(keep + n, room), last
+        for part, x in zip(self._parts, columns, strict=True):
+            if keep < filled:
+                part[:keep] = part[filled - keep : filled]
+            part[keep : self._filled] = x[-room:]
 
     def clear(self) -> None:
         """Forget all samples, as after a gap."""
-        self._parts.clear()
-        self.first = self.last
+        self._filled = 0
 
     def since(self, first: int) -> Samples | None:
-        """Return samples from number `first` on; None where they are not there."""
+        """Return samples from number `first` on, views that the next `add` may overwrite; None where they are not
+        there.
+        """
         if not self.first <= first < self.last:
             return None
-        whole = [
-            np.concatenate(x)
-            for x in zip(*((p.u, p.y, p.forcing) for p in self._parts), strict=True)
-            if x[0] is not None
-        ]
-        u, y, *more = (x[first - self.first :] for x in whole)
+        u, y, *more = (x[first - self.first : self._filled] for x in self._parts)
         return Samples(u=u, y=y, forcing=more[0] if more else None)
 
 

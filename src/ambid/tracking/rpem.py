@@ -341,7 +341,7 @@ class PhysicalRpem:
         k, n = 0, y.shape[0]
         errors = np.full(samples.y.shape, np.nan)
         while k < n:
-            n_taken, innovations, evidence = self.stream.feed(samples.part(k))
+            n_taken, innovations, evidence = self.stream.feed(samples.part(k) if k else samples)
             errors[k : k + n_taken] = innovations
             k += n_taken
             self.n_used += n_taken
