@@ -234,6 +234,42 @@ def test_without_a_drift_little_is_suspected():
     assert np.mean(seen) < 0.06
 
 
+@pytest.mark.parametrize("known", [1.0, 1e4, 1e8])
+def test_a_ramp_that_the_data_do_not_tell_at_all_is_none(known):
+    """All that is known of two numbers came in one chunk, of their sum: what is left of a ramp's information is
+    rounding, and with little known before so is the covariance.
+    """
+    p, rates = 3, np.full(3, 1e-9)
+    drift, before = DriftRates(rates, rates, 10.0 * rates, 0.05), ParameterFilter(np.zeros(p), known * np.eye(p))
+    J = np.array([[1e4, 1e4, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    for k in range(30):
+        evidence = Evidence(
+            names=("a", "b", "c"), at=np.zeros(p), J=J if k == 9 else 0.0 * J, r=np.ones(p), rest=1.0, n_samples=9,
+            n_outputs=1, first=k, last=k + 1,
+        )  # fmt: skip
+        drift.add(evidence, before)
+        before.absorb(evidence)
+        assert drift.look(np.eye(p), 1.0).size == 0
+
+
+def test_a_look_is_one_between_chunks_and_the_same_without_adaptation():
+    p, rates = 3, np.full(3, 1e-9)
+    evidence = Evidence(
+        names=("a", "b", "c"), at=np.zeros(p), J=np.eye(p), r=np.zeros(p), rest=1.0, n_samples=9, n_outputs=1, first=0,
+        last=1,
+    )  # fmt: skip
+    for ceiling in (10.0 * rates, rates):
+        drift, known = DriftRates(rates, rates, ceiling, 0.025), ParameterFilter(np.zeros(p), np.eye(p))
+        first = drift.look(np.eye(p), 1.0)
+        for _ in range(13):
+            drift.add(evidence, known)
+        assert first.size == 0
+        assert drift.look(np.eye(p), 1.0) is (None if drift.adapts else first)
+        drift.restart()
+        drift.add(evidence, known)
+        assert drift.look(np.eye(p), 1.0) is first  # the window before is forgotten at once
+
+
 def test_a_ramp_is_tested_as_in_the_dense_regression():
     """Of all rows at once: numbers known before, a ramp along each cause, and white noise."""
     rng, p, noise = np.random.default_rng(10), 3, 1.7

@@ -114,6 +114,7 @@ _RAMPS = np.array([5, 7, 10, 14, 20])  # chunks since which something may drift 
 # statistics from which it may be so: chance passes each as often, in 3e-4 of the cases for each chunk of the window
 _BEGUN = np.array([10.1, 9.5, 8.8, 8.2, 7.6])
 _ALIKE = 9.2  # by which statistics of drifts differ by chance in one of a hundred cases
+_ROUNDED = 1e-9  # of a ramp's information: what is left of it beside the other numbers is not known better
 _BETWEEN = 0.02  # of a statistic, that is lost where a drift began in the middle between two windows
 
 
@@ -134,6 +135,7 @@ class DriftRates:
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
         self._H, self._g = np.zeros((room, p, p)), np.zeros((room, p))
+        self._none = np.zeros((3, 0, p))
         self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
         self._chunk = EvidenceSum(p)
         self._count = self._next = self._since = self._looks = 0
@@ -198,12 +200,15 @@ class DriftRates:
         much the numbers are off, where they are, with what variance, (3, n, p), as of `ramps`; `noise`: the residual's
         variance.
         """
+        windows = int(np.searchsorted(_RAMPS, self._count, side="right"))
+        if not (windows and self.adapts):
+            return self._none
         if self._chunk.blocks:
             return None
-        windows = int(np.searchsorted(_RAMPS, self._count, side="right"))
-        if not windows:
-            return np.zeros((3, 0, self.variance.size))
-        T, ends = self.ramps(_RAMPS[:windows], toward, noise)
+        try:
+            T, ends = self.ramps(_RAMPS[:windows], toward, noise)
+        except np.linalg.LinAlgError:  # numbers of which so little was known that the data's information is lost
+            return self._none
         likely = np.maximum(_BEGUN[:windows, None], (1.0 - _BETWEEN) * T.max() - _ALIKE) < T
         return np.asarray(ends[:, likely])
 
@@ -227,7 +232,8 @@ class DriftRates:
         slopes, moved = toward @ Hw, (S @ (g[..., None] + H @ q[..., None]))[..., 0][:, None]
         drawn = slopes @ S
         score = gw @ toward.T - (slopes * moved).sum(axis=2)
-        power = np.maximum(((toward @ Hww) * toward - drawn * slopes).sum(axis=2), 1e-30)[..., None]
+        alone = ((toward @ Hww) * toward).sum(axis=2)
+        power = np.maximum(alone - (drawn * slopes).sum(axis=2), _ROUNDED * alone + 1e-30)[..., None]
         size, on = -score[..., None] / power, (n[..., None] + 1.0) / n[..., None] * toward
         left = moved + size * drawn  # of what was known before: a drift that is no ramp since then shows in it
         spread = np.diagonal(S, axis1=1, axis2=2)[:, None] + (on - drawn) ** 2 / power + left**2

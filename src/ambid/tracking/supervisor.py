@@ -195,8 +195,8 @@ class Supervisor:
             if confirmed or (self.diagnosis.settling and self.publication.accepted is not accepted):
                 self.diagnosis.settling = False
                 self.level.restart()
-        begun = rpem.begun()
-        self._begun = self._begun if begun is None else begun
+            begun = rpem.begun()
+            self._begun = self._begun if begun is None else begun
         if self.diagnosis.renewed:
             self._activate()
         if usable or self.diagnosis.doubted:  # a knock that is set aside is no error of the model
