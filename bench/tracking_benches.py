@@ -160,7 +160,7 @@ BENCHES: Mapping[str, Callable[[], TrackBench]] = MappingProxyType(
 
 
 def supervised(
-    start: TrackedNumbers | Estimate, *, first: int = 0, listener: Callable[[Event], None] | None = None
+    start: TrackedNumbers | Estimate, *, first: int = 0, listener: Callable[[Event], None] = lambda _: None
 ) -> Supervisor:
     """The supervisor as the command makes it; `first` is the number of its first sample."""
     numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)

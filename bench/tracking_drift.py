@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from ambid.recursive.lines import Event
 from table import Table
 from tracking_benches import BENCHES, BLOCK, PHYSICAL, RATE, START_S, Array, TrackBench, blocks, identified, supervised
 
@@ -35,7 +36,8 @@ def drift_of(bench: TrackBench, seed: int) -> Drift:
     """Track one record; the drift begins where the start's record ends."""
     stream = bench.stream("drift", seed, START_S + DRIFT_S, START_S)
     _, first = next(stream)  # a second
-    supervisor, values, sds, times = supervised(identified(first), first=first.y.shape[0]), [], [], []
+    events, values, sds, times = list[Event](), [], [], []
+    supervisor = supervised(identified(first), first=first.y.shape[0], listener=events.append)
     for k, part in stream:
         for j, piece in blocks(part):
             supervisor.feed(piece, k + j)
@@ -56,7 +58,7 @@ def drift_of(bench: TrackBench, seed: int) -> Drift:
         rms=named(np.sqrt(np.mean(error**2, axis=0))),
         sd=named(np.median(sd, axis=0)),
         inside=named(inside.mean(axis=0)),
-        alarms=sum(supervisor.log.counts.get(kind, 0) for kind in ("change", "disturbed")),
+        alarms=sum(event.kind in ("change", "disturbed") for event in events),
     )
 
 

@@ -64,6 +64,7 @@ def hours_of(bench: str, scenario: str, seed: int, seconds: float) -> Hours:
     start = tracked_numbers(identified(b.samples("steady", seed, 1.0)))
 
     def listen(event: Event) -> None:
+        found.counts[event.kind] = found.counts.get(event.kind, 0) + 1
         if len(found.events) < 1000:
             found.events.append(told_of(event))
 
@@ -88,7 +89,6 @@ def hours_of(bench: str, scenario: str, seed: int, seconds: float) -> Hours:
             found.memory_early = max(found.memory_early, _resident())
         found.memory_late = max(found.memory_late, _resident())
     found.inside = {name: n / sum(found.states.values()) for name, n in inside.items()}
-    found.counts = dict(supervisor.log.counts)
     return found
 
 

@@ -7,13 +7,14 @@ of much larger innovations is set aside: perhaps a knock. If that goes on unexpl
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 
 from ambid.recursive.lines import Event
 from ambid.tracking.evidence import Evidence, RecentSamples, Samples
-from ambid.tracking.gate import DecisionLog, Publication
+from ambid.tracking.gate import Publication
 from ambid.tracking.monitors import Alarm, ChangeDetector
 from ambid.tracking.recovery import Recovered, Recovery, begin
 from ambid.tracking.rpem import ParameterFilter, PhysicalRpem
@@ -96,10 +97,16 @@ class Diagnosis:
     """
 
     def __init__(
-        self, rpem: PhysicalRpem, publication: Publication, log: DecisionLog, *, t0: float, false_alarms_per_hour: float
+        self,
+        rpem: PhysicalRpem,
+        publication: Publication,
+        tell: Callable[[Event], None],
+        *,
+        t0: float,
+        false_alarms_per_hour: float,
     ) -> None:
         numbers, imperfect = rpem.numbers, rpem.numbers.overdispersion
-        self._rpem, self._publication, self._log, self._t0 = rpem, publication, log, t0
+        self._rpem, self._publication, self._tell, self._t0 = rpem, publication, tell, t0
         kinds = {**dict(zip(numbers.names, numbers.kinds, strict=True)), **dict.fromkeys(numbers.joints, "parameter")}
         self._kinds = kinds
         self._bench = tuple(n for n, kind in kinds.items() if kind in _BENCH)
@@ -165,7 +172,7 @@ class Diagnosis:
             if unexplained(evidence) <= WILD * self._detector.noise:
                 self.unexplained.over()
                 self._detector.restart(sample)
-                self._log.add(Event(kind="thawed", t=t, why="the model explains the data again"))
+                self._tell(Event(kind="thawed", t=t, why="the model explains the data again"))
             elif self.unexplained.search_due(t):
                 why = "the model does not explain the data"
                 self._search(Event(kind="disturbed", t=t, why=why, values={"detected": t}), sample, self._bench)
@@ -213,7 +220,7 @@ class Diagnosis:
         )
         if alarm.by == "noise":
             return self._noisy(alarm, event, unexplained(evidence))
-        self._log.add(event)
+        self._tell(event)
         self.unexplained.over()
         doubt = self._publication.restart() ** 2  # so much may have been taken for what goes on
         for filter_ in (self._rpem.filter, *(known for _, known in self._history)):
@@ -245,12 +252,12 @@ class Diagnosis:
         usual, sample = self._detector.noise, self._rpem.stream.sample
         if variance <= WILD * usual:  # a little more, or less, than usual over many blocks
             if alarm.noise > _WORTH:
-                self._log.add(event)
+                self._tell(event)
             self._take_as_noise(usual * alarm.noise)
             return True
         self.unexplained.count(variance)
         if self.unexplained.blocks == 1:
-            self._log.add(event)
+            self._tell(event)
         if self.unexplained.persists:
             self._search(event, alarm.onset, self._bench)
         else:
@@ -290,7 +297,7 @@ class Diagnosis:
             for place in numbers.places("parameter"):  # the recursion has to find what no search has
                 self._rpem.filter.widen(numbers.direction(numbers.names[place]), _UNKNOWN)
             why = "nothing explains the data after the change; all parameters are re-estimated"
-            self._log.add(Event(kind="disturbed", t=t, why=why))
+            self._tell(Event(kind="disturbed", t=t, why=why))
             self._fresh_start()
             self._publication.unconfirmed = True
 
@@ -337,7 +344,7 @@ class Diagnosis:
             self.changes.pop()
         if not disturbed:
             self.changes.append(event)
-        self._log.add(event)
+        self._tell(event)
 
     def _no_change(self, t: float) -> None:
         """No change explains wild innovations: they are noise as long as that can be believed."""
@@ -347,12 +354,12 @@ class Diagnosis:
         if self.unexplained.believable and not deaf:
             self.unexplained.over()
             self._take_as_noise(level)
-            self._log.add(
+            self._tell(
                 Event(kind="disturbed", t=t, why=f"{size}, and no change of a parameter explains it: treated as noise")
             )
             return
         if not deaf:
-            self._log.add(Event(kind="frozen", t=t, why=f"{size}: the model does not fit, and learning is suspended"))
+            self._tell(Event(kind="frozen", t=t, why=f"{size}: the model does not fit, and learning is suspended"))
         self.unexplained.close_ears(t)
 
     def _fresh_start(self) -> None:

@@ -1,6 +1,6 @@
 """From the working estimate to the published one: candidates, their validation, and the operator's orders.
 
-Only what later data confirmed, or the operator ordered, is published; decisions are logged with reasons. The difference
+Only what later data confirmed, or the operator ordered, is published; decisions are told with reasons. The difference
 in loss between candidate and accepted numbers on later evidence is normal, mean and variance known from triangle and
 covariance. Acceptance is followed by a probation, which may go back.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal, get_args
@@ -309,21 +309,6 @@ def _squared_length(d: Array, covariance: Array) -> float:
     return math.inf if failed else float(d @ solved)
 
 
-class DecisionLog:
-    """Count the events of each kind, and pass them to a `listener`."""
-
-    def __init__(self, listener: Callable[[Event], None] | None = None) -> None:
-        self.counts: Counter[str] = Counter()
-        self._listener, self._lock = listener, threading.Lock()
-
-    def add(self, event: Event) -> None:
-        """Count an event, of any thread."""
-        with self._lock:
-            self.counts[event.kind] += 1
-        if self._listener is not None:
-            self._listener(event)
-
-
 Flag = Literal["track", "hold", "accept", "revert"]
 Order = Literal["accept", "revert"]
 _FLAGS: tuple[str, ...] = get_args(Flag)
@@ -428,9 +413,9 @@ class Publication:
     moved.
     """
 
-    def __init__(self, rpem: PhysicalRpem, operator: Operator, log: DecisionLog, t0: float) -> None:
+    def __init__(self, rpem: PhysicalRpem, operator: Operator, tell: Callable[[Event], None], t0: float) -> None:
         numbers = rpem.numbers
-        self._rpem, self._operator, self._log = rpem, operator, log
+        self._rpem, self._operator, self._tell = rpem, operator, tell
         self.gate = Gate(
             numbers.names,
             start=numbers.start,
@@ -460,7 +445,7 @@ class Publication:
         """Offer the working estimate. `t`: s of record."""
         refused = self.gate.propose(self._rpem.filter.q, self._rpem.filter.covariance, t, why)
         if refused is not None and self.unconfirmed:
-            self._log.add(refused)
+            self._tell(refused)
 
     def judge(self, evidence: Evidence, t: float) -> bool:
         """Decide on the candidate with one more block, already taken in, ended at `t` (s of record); offer the next.
@@ -485,7 +470,7 @@ class Publication:
 
     def _decided(self, event: Event, before: Accepted) -> bool:
         if event.kind != "accepted":
-            self._log.add(event)
+            self._tell(event)
             if event.kind == "reverted":
                 self._rpem.filter.set(self.accepted.values, self.accepted.covariance)
                 self._rpem.move_to(self.accepted.values)
@@ -493,7 +478,7 @@ class Publication:
         self.updates += not np.array_equal(self.accepted.values[self._own], before.values[self._own])
         if not self.unconfirmed:
             return False
-        self._log.add(event)
+        self._tell(event)
         self.unconfirmed = False
         return True
 
@@ -524,16 +509,16 @@ class Publication:
         before = self.accepted
         if order == "accept" and searching:
             why = "a change was found but not its new value; there is nothing to accept"
-            self._log.add(Event(kind="refused", t=t, why=why))
+            self._tell(Event(kind="refused", t=t, why=why))
         elif order == "accept":
             self.gate.restart()
             self.propose(t, "the present estimate")
             self._undo.append(before)
-            self._log.add(self.gate.accept(t))
+            self._tell(self.gate.accept(t))
             self.unconfirmed = False
         else:
-            self._log.add(self.gate.revert(t, "by order of the operator", self._undone()))
-            self._log.add(self._operator.set("hold", t, "after going back, until the operator sets track"))
+            self._tell(self.gate.revert(t, "by order of the operator", self._undone()))
+            self._tell(self._operator.set("hold", t, "after going back, until the operator sets track"))
         changed = self.accepted is not before
         self.updates += changed
         return changed
@@ -541,6 +526,6 @@ class Publication:
     def order(self, flag: str, t: float) -> None:
         """Take a flag of the operator; of two orders before the next block the first counts. `t`: s of record."""
         try:
-            self._log.add(self._operator.set(flag, t))
+            self._tell(self._operator.set(flag, t))
         except EstimationError as waiting:
-            self._log.add(Event(kind="refused", t=t, why=str(waiting)))
+            self._tell(Event(kind="refused", t=t, why=str(waiting)))

@@ -4,7 +4,7 @@ whatever the blocks; where samples are missing or rejected the lines go on, and 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ _EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
 
 
 class Reporter:
-    """Feeds a supervisor, whose `log` calls `Reporter.note`, and makes lines of what it says. `every_s`: reporting
+    """Feeds a supervisor, whose listener is `Reporter.note`, and makes lines of what it says. `every_s`: reporting
     interval, s, at least a sample; `on_line`: called with each line, may return the operator's flags; `flags`: what is
     set when, s of record; `t0`: time of sample 0, s of record; `first`: number of the first tracked sample; `foreseen`:
     events known before, told in the line of their time. `lines`, `samples`, `rejected`: lines made, samples used,
@@ -51,10 +51,12 @@ class Reporter:
         supervisor.begin(first)
         self._flags = sorted(flags, key=lambda flag: flag[0])
         self._events: list[Event] = []
+        self._counts: Counter[str] = Counter()
         self.lines = self.samples = self.rejected = 0
 
     def note(self, event: Event) -> None:
-        """Keep an event for the next line."""
+        """Count an event, and keep it for the next line."""
+        self._counts[event.kind] += 1
         self._events.append(event)
 
     def consume(self, samples: Samples, first: int, *, restart: bool = False) -> None:
@@ -79,7 +81,7 @@ class Reporter:
         passing = rejection.kind in _PASSING
         if passing:
             self._pass(first)
-        self.supervisor.log.add(
+        self.note(
             Event(
                 kind="rejected",
                 t=self._t0 + rejection.t,
@@ -122,7 +124,7 @@ class Reporter:
         self._obey(self._next)
         s.wait(self._next)
         while self._foreseen and self._foreseen[0].t <= self._t0 + self._count * self.every_s:
-            s.log.add(self._foreseen.popleft())
+            self.note(self._foreseen.popleft())
         events, self._events = tuple(self._events), []
         line = TrackLine(
             t=self._t0 + self._count * self.every_s,
@@ -148,7 +150,7 @@ class Reporter:
             updates=s.publication.updates,
             rejected_samples=self.rejected,
             changes=tuple(s.diagnosis.changes),
-            counts=dict(s.log.counts),
+            counts=dict(self._counts),
             latency=latency,
             complete=complete,
             update_s=s.diagnosis.update_s,

@@ -15,7 +15,7 @@ from ambid.arrays import Array
 from ambid.recursive.lines import Choice, Event, State, TrackedValue
 from ambid.tracking.diagnosis import LONGEST_S, Diagnosis
 from ambid.tracking.evidence import Evidence, RecentSamples, Samples
-from ambid.tracking.gate import Accepted, DecisionLog, Operator, Publication, beside, published
+from ambid.tracking.gate import Accepted, Operator, Publication, beside, published
 from ambid.tracking.monitors import ErrorLevel, ExcitationMonitor
 from ambid.tracking.numbers import TrackedNumbers
 from ambid.tracking.recovery import begin
@@ -40,7 +40,7 @@ class Supervisor:
         operator: Operator | None = None,
         false_alarms_per_hour: float = 0.05,
         t0: float = 0.0,
-        listener: Callable[[Event], None] | None = None,
+        listener: Callable[[Event], None] = lambda _: None,
     ) -> None:
         numbers, block_s = rpem.numbers, rpem.block_s
         self.rpem, self.operator, self._t0 = rpem, operator or Operator(), t0
@@ -54,9 +54,9 @@ class Supervisor:
             window_s=max(1.0, 4 * block_s),
         )
         self.level = ErrorLevel(limit, max(_RELEASE * limit, min(1.1, limit)), max(2, round(_LEVEL_S / block_s)))
-        self.log = DecisionLog(listener=listener)
-        self.publication = Publication(rpem, self.operator, self.log, t0)
-        self.diagnosis = Diagnosis(rpem, self.publication, self.log, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
+        self._tell = listener
+        self.publication = Publication(rpem, self.operator, listener, t0)
+        self.diagnosis = Diagnosis(rpem, self.publication, listener, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
         self._silent, self._heard, self._deaf_s = False, 0, 0.0  # no evidence since when: sample, and s
         self._spoken = False  # whether there has been any
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
@@ -162,7 +162,7 @@ class Supervisor:
             why = (
                 f"the predictor has not settled for {most_s:.3g} s: after each interruption it needs {settling_s:.3g} s"
             )
-            self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {most_s:.3g} s" if missing else why))
+            self._tell(Event(kind="frozen", t=t, why=f"no usable sample for {most_s:.3g} s" if missing else why))
         self._obey(t)
 
     def order(self, flag: str) -> None:
@@ -179,11 +179,11 @@ class Supervisor:
         if self._silent:
             self._silent = False
             without_s = (evidence.first - self._heard) / self._rate
-            self.log.add(Event(kind="thawed", t=t, why=f"the data are informative again after {without_s:.3g} s"))
+            self._tell(Event(kind="thawed", t=t, why=f"the data are informative again after {without_s:.3g} s"))
         self._heard, self._deaf_s, self._spoken = evidence.last, 0.0, True
         events = self._excitation.update(evidence, t)
         for event in events:
-            self.log.add(event)
+            self._tell(event)
         if events:
             self._activate()
         rpem.predict()
@@ -205,7 +205,7 @@ class Supervisor:
             explained = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
             if self.level.above and not (before or explained):
                 why = f"the error is {error:.2f} times that at identification, above the limit of {self.level.limit:g}"
-                self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
+                self._tell(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
         self._obey(t)
 
     def _obey(self, t: float) -> None:

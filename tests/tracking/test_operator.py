@@ -3,31 +3,7 @@ import threading
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.lines import Event
-from ambid.tracking.gate import DecisionLog, Operator
-
-
-def event(t, kind="accepted"):
-    return Event(kind=kind, t=t, why="because")
-
-
-def test_the_log_counts_all_and_tells_them_on():
-    heard = []
-    log = DecisionLog(listener=heard.append)
-    for k in range(10):
-        log.add(event(float(k), "accepted" if k % 2 else "refused"))
-    assert dict(log.counts) == {"accepted": 5, "refused": 5}
-    assert [e.t for e in heard] == [float(k) for k in range(10)]
-
-
-def test_the_log_takes_events_of_many_threads():
-    log = DecisionLog()
-    threads = [threading.Thread(target=lambda: [log.add(event(0.0)) for _ in range(500)]) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert log.counts["accepted"] == 2000
+from ambid.tracking.gate import Operator
 
 
 def test_flags_are_states_and_orders():
