@@ -160,7 +160,7 @@ def main(n: int, kills: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         beside_a_loop(n, Path(folder))
     with tempfile.TemporaryDirectory() as folder:
-        time_left(max(n // 5, 100), Path(folder))
+        time_left(max(n // 5, 40), Path(folder))
     for how in ("workers", "local:2", "scheduler"):
         with tempfile.TemporaryDirectory() as folder:
             under_kills(kills, Path(folder), how)

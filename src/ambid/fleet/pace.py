@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 
-_USUAL = 0.5  # of a record's cost goes by its size, until what comes says otherwise
+_FEW = 4  # records that tell of no slope
 _KEPT = 0.98  # of what was learnt, with each record: what comes next is like the last fifty
 
 
@@ -51,7 +51,7 @@ class Pace:
         sums = self._sums if self._sums[0] else self._first
         if not sums[0]:
             return None
-        fixed, by_size = _line(sums, (self._first, self._sums))
+        fixed, by_size = _line(*sums)
         mean_s = max(self.mean_s, 1e-9)
         passed = time.monotonic() - self._since
         at_once = (self._busy_s + self._workers * mean_s) / (passed + mean_s)  # at first as many as there are workers
@@ -64,22 +64,18 @@ class Pace:
         return None if left is None else passed / max(passed + left, 1e-9)
 
 
-def _line(level: Sequence[float], groups: Sequence[Sequence[float]]) -> tuple[float, float]:
+def _line(n: float, size: float, squares: float, seconds: float, products: float, powers: float) -> tuple[float, float]:
     """Return what is the same for all records, and what one costs by its size; neither is negative.
 
-    The slope is that within the groups, of which one is dearer by what all need, and counts beside the usual one as far
-    as it stands out of its scatter: it is carried to sizes that have not come yet.
+    A slope counts as far as it stands out of its scatter: it is carried to sizes that have not come yet.
     """
-    n, size, _, seconds, *_ = level
-    spread = common = power = free = 0.0
-    for many, x, squares, s, products, powers in (g for g in groups if g[0]):
-        spread, common = spread + squares - x * x / many, common + products - x * s / many
-        power, free = power + powers - s * s / many, free + many - 1.0
-    if spread <= 1e-9 * sum(g[2] for g in groups) or seconds <= 0.0:
+    spread, common = squares - size * size / n, products - size * seconds / n
+    if n < _FEW or spread <= 1e-9 * squares:
         return seconds / n, 0.0
-    slope = usual = _USUAL * seconds / size
-    if free > 1.2:
-        scatter = max(power - common**2 / spread, 0.0) / max(free - 1.0, 0.5) / spread  # of the slope, squared
-        slope = max(usual + (common / spread - usual) / (1.0 + scatter / usual**2), 0.0)
+    slope = common / spread
+    scatter = max(powers - seconds * seconds / n - slope * common, 0.0) / (n - 2.0) / spread  # of the slope, squared
+    slope *= max(0.0, 1.0 - 4.0 * scatter / max(slope * slope, 1e-300))
+    if slope <= 0.0:
+        return seconds / n, 0.0
     fixed = (seconds - slope * size) / n
     return (fixed, slope) if fixed >= 0.0 else (0.0, seconds / size)
