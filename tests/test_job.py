@@ -114,10 +114,11 @@ def test_fixed_and_prior_parameters(estimate):
     assert both.data_share == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_prior_against_the_data_does_not_pass_unnoticed(estimate):
+@pytest.mark.parametrize("off", [-14, 14])
+def test_a_prior_against_the_data_does_not_pass_unnoticed(estimate, off):
     # ten standard deviations of the data away, and held as tightly as they hold: one of the two is wrong
     free = estimate.parameter("R")
-    prior = Parameter(name="R", unit="ohm", role="prior", value=free.value + 14 * free.sd, sd=free.sd)
+    prior = Parameter(name="R", unit="ohm", role="prior", value=free.value + off * free.sd, sd=free.sd)
     found = identify(record(), with_parameter(default_rig(), R=prior))
     assert not found.passed
 

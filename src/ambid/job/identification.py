@@ -18,6 +18,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, plain_json, warnings_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
+from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.job.data import (
     Clock,
     Reading,
@@ -255,8 +256,8 @@ def _with_facts(refusal: str, bench: Record, rig: Rig) -> str:
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
     """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if the
     model fits now, fewer checks fail, and none that did not before, but that a fixed value shows as wrong. Else the
-    first estimate stays, with its causes; also where a fixed value may be what is wrong, unless the cause changes in
-    time.
+    first estimate stays, with its causes; also where a fixed value or a prior may be what is wrong, unless the cause
+    changes in time.
     """
     from ambid.validation.causes import extended, told
     from ambid.validation.residuals import P_LEAST
@@ -268,7 +269,8 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
         named, fixed = estimate.checks.get("causes"), estimate.checks["fixed_agree"].p
         if named is None or named.passed:
             break
-        doubtful = fixed is not None and fixed < P_LEAST
+        prior = chi_squared_tail(1, estimate.checks["priors_agree"].values["largest_sd"] ** 2)
+        doubtful = min(prior, 1.0 if fixed is None else fixed) < P_LEAST
         more = extended(fit, first.operating_point, found, plain, taken, doubtful=doubtful)
         if more is None:
             break

@@ -64,6 +64,8 @@ _GROWING = {
     "friction", "amplifier_lag",
 }  # fmt: skip
 """Causes whose signals are known but for their sizes."""
+_OPPOSING = {"dead_time", "friction"}
+"""Causes that physics gives a sign."""
 _GOES_ON = (
     0.01  # probability by chance, of waves that are faster, below which a walk goes on beyond those that were taken
 )
@@ -165,7 +167,9 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
-    return [c for c in found if c.name != "slow_current" or c is found[0]]
+    return [
+        c for c in found if (c.name != "slow_current" or c is found[0]) and not (c.name in _OPPOSING and c.size < 0.0)
+    ]
 
 
 def _fixed(fit: Fit) -> Iterator[Cause]:
