@@ -61,13 +61,3 @@ def test_modes_of_utrc_come_out_of_levitated_records(utrc, excited):
     assert [m.frequency_hz.value for m in excited.modes] == pytest.approx(
         free, rel=0.03
     )  # the loop moves them a little
-
-
-def test_stochastic_subspace_of_utrc_agrees_without_input(utrc, excited):
-    noisy = record_of(replace(utrc, excitation="none", force_noise=20.0, periods=6), 2)
-    alone = ambid.frf(noisy, output=of_axes("position"), modes="auto", band=(100, 1150)).modes
-    for m in excited.modes[1:]:  # the first is damped by the loop so well that six seconds of noise do not show it
-        near = min(alone, key=lambda x: abs(x.frequency_hz.value - m.frequency_hz.value))
-        spread = np.hypot(near.frequency_hz.sd, m.frequency_hz.sd)
-        assert abs(near.frequency_hz.value - m.frequency_hz.value) < 4 * spread
-        assert spread < 0.02 * m.frequency_hz.value

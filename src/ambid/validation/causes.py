@@ -27,7 +27,6 @@ from ambid.estimation.likelihood import (
     free_one,
     innovations,
     residual_blocks,
-    run,
     search,
     weight_of,
     workspace_near,
@@ -36,6 +35,7 @@ from ambid.estimation.linear import column_sizes, directions, periods_near, wave
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
+from ambid.validation.cause_signals import MANY, WAVES, Column, Course, groups_of, half_waves
 from ambid.validation.facts import between_samples
 
 _LONGEST = 100_000  # samples that are looked at, the busiest
@@ -43,18 +43,13 @@ _CHANCE = 1e-4  # probability below which a cause counts as seen
 _ALIKE = 0.7  # part of the strongest cause's gain from which another explains the record about as well
 _BLIND = 1e-12  # eigenvalue, over the largest, of directions that are not seen
 _SAME = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
-_WAVES = 8  # half waves over the record of a force or voltage that walks
-_MANY = 40  # and of one that was looked for because a check failed
 _SMOOTH = 9  # lines that are averaged to see a mode or a band
 _BAND = 10  # lines on either side of a band's middle
-_DAMPING = (0.005, 0.03)  # with which it is looked for
 _NARROW = 0.6  # part of the power around a line that its own three frequencies hold
 _LINES, _SKIRT = 6, 4  # lines that are taken together, and how far each reaches
 _CLEAR = 10.0  # power, of noise one, that no other channel of a line may leave less than, nor its own more
 _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
-_REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
-_PLAY = 0.1  # of the current's range: width of a hysteresis
 _SAME_COURSE = ("line", "slow_force", "slow_voltage", "slow_current", "coloured_force", "coloured_voltage")
 """Causes whose signals do not depend on the fit."""
 _IN_TIME = {*_SAME_COURSE, "r_drift"}
@@ -76,12 +71,6 @@ _TURNS = 8  # in which sizes and parameters are found in turn
 _SETTLED = 0.1  # gain below which they are
 
 
-Column = tuple[tuple[str, Array], ...]
-"""Where signals of one size enter, force, voltage, position or current, and their courses, SI: at each sample, of a
-force or a voltage the mean up to the next. None may hold more than what is known before the sample that it shows in.
-"""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cause:
     """A cause that the innovations may have."""
@@ -97,22 +86,6 @@ class Cause:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Course:
-    """Signals over the samples that are looked at, deviations from the operating point in SI."""
-
-    t: Array  # from -1 to 1
-    x: Array
-    v: Array
-    i: Array
-    u: Array
-    before: Array  # rate of the current before each sample, A/s
-    u_before: Array  # voltage before each sample: that after it may be fed back from the sample itself
-    theta: Mapping[str, float]
-    i0: float
-    rate_hz: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Look:
     """A fit with its innovations over the samples that are looked at."""
 
@@ -121,7 +94,7 @@ class _Look:
     weight: Array
     e: Array  # (n, n_outputs), scaled
     at: slice
-    course: _Course
+    course: Course
 
 
 def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
@@ -148,7 +121,7 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     spectra = _spectra(look.e @ look.weight.T)
     lines = _lines(look)
     top, chance = _top(spectra, lines) if thorough else (0, 1.0)
-    groups = list(_groups(course, top * rate_hz / course.t.size, thorough=thorough))
+    groups = list(groups_of(course, top * rate_hz / course.t.size, thorough=thorough))
     if chance < _LINE:
         waves = [w for k in range(max(top - _BAND, 1), top + _BAND + 1) for w in waves_at(k, course.t.size).T[:2]]
         groups += [(f"coloured_{way}", tuple(((way, w),) for w in waves)) for way in ("force", "voltage")]
@@ -248,7 +221,7 @@ def _with_causes(
             on = [_goes_on(look, c) for c in parts]
             if not any(on):
                 return replace(fit, beside=_beside(look, columns)), tuple(parts)
-            if any(goes and len(c.columns) >= _MANY for goes, c in zip(on, parts, strict=True)):
+            if any(goes and len(c.columns) >= MANY for goes, c in zip(on, parts, strict=True)):
                 return None
             parts = [_faster(c, look.course) if goes else c for goes, c in zip(on, parts, strict=True)]
             step = [np.zeros(c.sizes.size) for c in parts]
@@ -260,14 +233,14 @@ def _goes_on(look: _Look, walk: Cause) -> bool:
     if not walk.name.startswith("slow"):
         return False
     count = len(walk.columns)
-    beyond = _waves(look.course.t, max(2 * count, _MANY))[count:]
+    beyond = half_waves(look.course.t, max(2 * count, MANY))[count:]
     return _tested(look, [(walk.name, tuple(((walk.channel, wave),) for wave in beyond))])[0].p < _GOES_ON
 
 
-def _faster(walk: Cause, course: _Course) -> Cause:
+def _faster(walk: Cause, course: Course) -> Cause:
     """Return a walk with faster waves beside its own."""
-    columns = tuple(((walk.channel, wave),) for wave in _waves(course.t, _MANY))
-    return replace(walk, columns=columns, sizes=np.append(walk.sizes, np.zeros(_MANY - walk.sizes.size)))
+    columns = tuple(((walk.channel, wave),) for wave in half_waves(course.t, MANY))
+    return replace(walk, columns=columns, sizes=np.append(walk.sizes, np.zeros(MANY - walk.sizes.size)))
 
 
 def told(cause: Cause) -> str:
@@ -278,12 +251,12 @@ def told(cause: Cause) -> str:
     return f"{cause.name} ({cause.size:.3g}{unit[cause.name]})" if cause.name in unit else cause.name
 
 
-def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
+def _again(cause: Cause, course: Course) -> tuple[Column, ...]:
     """Return a cause's signals at another fit: those of lines and walks are the same."""
     if cause.name in _SAME_COURSE:
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
-    groups = _groups(course, 0.0, thorough=False)
+    groups = groups_of(course, 0.0, thorough=False)
     return next(columns for name, columns in groups if (name, columns[0][0][0], len(columns)) == own)
 
 
@@ -300,7 +273,7 @@ def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Arra
     return replace(problem, y=y, extra=extra)
 
 
-def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> _Course:
+def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> Course:
     problem = fit.problem
     x, v, i = (states * problem.scales.state).T
     theta, delay = problem.parameters(fit.vector), problem.delay_samples(fit.vector)
@@ -309,84 +282,11 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> _
     raw = problem.u[np.maximum(np.arange(first, first + x.size + 2), 0), 0]
     held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from one before on
     rest, u, last = theta["R"] * i + theta["k_i"] * v, held[1:], held[:-1]
-    return _Course(
+    return Course(
         t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
         before=(last - rest) / theta["L"],
         theta=theta, i0=means.get("current", 0.0), rate_hz=problem.rate_hz,
     )  # fmt: skip
-
-
-def _groups(s: _Course, mode: float, *, thorough: bool) -> Iterator[tuple[str, tuple[Column, ...]]]:
-    """Yield the causes with their signals; a size is that of the first. `mode`: its frequency, Hz."""
-    eddy = _rate(s.before, s.rate_hz)  # of the flux, where it shunts the coil; of the force alone
-    yield "eddy_pole", ((("force", -s.theta["k_i"] * _rate(s.i, s.rate_hz)),), (("voltage", s.theta["L"] * eddy),))
-    yield "sensor_lag", ((("position", -s.v),),)
-    yield "current_sensor_pole", ((("current", -s.before),),)
-    yield "cross_talk", ((("position", s.i),), (("position", s.u_before),))
-    yield "cross_talk", ((("current", s.x),), (("current", s.u_before),))
-    yield "r_drift", ((("voltage", _between(-s.t * (s.i0 + s.i))),),)
-    yield "dead_time", ((("voltage", -_between(np.sign(s.i0 + s.i))),),)
-    yield "friction", ((("force", -_between(np.sign(s.v))),),)
-    step = np.append(0.0, s.u_before - s.u)
-    yield "amplifier_lag", tuple((("voltage", np.append(np.zeros(k), step[1:-k])),) for k in (1, 2))
-    for channel in ("force", "voltage", "current"):
-        yield f"slow_{channel}", tuple(((channel, wave),) for wave in _waves(s.t, _WAVES))
-    for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
-        yield "curvature", tuple(_curvature(s, degree))
-    if not thorough:
-        return
-    yield "limiter", tuple((("voltage", -end),) for signal in (s.u, s.u - s.u_before) for end in _ends(signal))
-    slack = _play(s.i, _PLAY * float(np.ptp(s.i))) - s.i
-    flux = -s.theta["L"] * _rate(slack, s.rate_hz)
-    yield "hysteresis", ((("force", s.theta["k_i"] * _between(slack)),), (("voltage", flux),))
-    yield "slow_force", tuple((("force", wave),) for wave in _waves(s.t, _MANY))
-    for damping in _DAMPING:
-        yield "flexible_mode", tuple((("position", q),) for q in _oscillation(s, mode, damping))
-
-
-def _ends(signal: Array) -> tuple[Array, Array]:
-    """Return by how much a signal is beyond its outer tenths, above and below."""
-    low, high = np.quantile(signal, (1.0 - _REACH, _REACH))
-    return np.maximum(signal - high, 0.0), np.minimum(signal - low, 0.0)
-
-
-def _waves(t: Array, count: int) -> list[Array]:
-    return [t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(2, count + 1))]
-
-
-def _curvature(s: _Course, degree: int) -> Iterator[Column]:
-    """Yield force and voltage of the terms x^a i^b of the co-energy, a + b = degree, over the sizes of the motion."""
-    size_x, size_i = max(float(s.x.std()), 1e-300), max(float(s.i.std()), 1e-300)
-    x, i = [np.ones_like(s.x)], [np.ones_like(s.i)]
-    for _ in range(degree):
-        x.append(x[-1] * (s.x / size_x))
-        i.append(i[-1] * (s.i / size_i))
-    for a in range(degree + 1):
-        b = degree - a
-        force, flux = a / size_x * x[max(a - 1, 0)] * i[b], b / size_i * x[a] * i[max(b - 1, 0)]
-        yield ("force", _between(force)), ("voltage", -_rate(flux, s.rate_hz))
-
-
-def _rate(signal: Array, rate_hz: float) -> Array:
-    """The mean rate from each sample to the next."""
-    return np.append(np.diff(signal), 0.0) * rate_hz
-
-
-def _play(x: Array, width: float) -> Array:
-    """Return what follows x through a slack of a width."""
-    out, at = np.empty_like(x), float(x[0])
-    for k, value in enumerate(x.tolist()):
-        at = min(max(at, value - 0.5 * width), value + 0.5 * width)
-        out[k] = at
-    return out
-
-
-def _oscillation(s: _Course, f: float, damping: float) -> tuple[Array, Array]:
-    """Return position and velocity, over the frequency, of an oscillator of frequency `f` that the magnet drives."""
-    period, omega = 1.0 / s.rate_hz, 2.0 * np.pi * f
-    wave = np.exp((-damping + 1j) * omega * period)
-    state = run(np.array([[wave.real, -wave.imag, 0.0], [wave.imag, wave.real, 1.0]]), s.i[:, None], np.zeros(2))[:-1]
-    return state[:, 0], state[:, 1]
 
 
 def _through(look: _Look, columns: Sequence[Column]) -> Array:
@@ -410,11 +310,6 @@ def _through(look: _Look, columns: Sequence[Column]) -> Array:
         state_scan(np.hstack(enter), w, np.zeros(n))
         out[:, j] = own + away @ w[:, :n].T
     return out
-
-
-def _between(signal: Array) -> Array:
-    """The mean from each sample to the next, as a disturbance that is held acts."""
-    return np.append(0.5 * (signal[1:] + signal[:-1]), signal[-1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -543,7 +438,7 @@ def _lines(look: _Look) -> list[_Line]:
         power, n_y = np.sum(np.abs(spectra) ** 2, axis=1), spectra.shape[1]
         median = float(np.median(power))
         usual = _mean(median, n_y)
-        power[: _WAVES // 2] = median  # what walks as slowly is no line
+        power[: WAVES // 2] = median  # what walks as slowly is no line
         j = int(np.argmax(power))
         ratio = float(power[j] / max(usual, 1e-300))
         p = float(power.size * (1.0 + ratio * (n_y > 1)) * np.exp(-min(ratio, 700.0)))
