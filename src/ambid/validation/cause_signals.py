@@ -73,8 +73,10 @@ def _ends(signal: Array) -> tuple[Array, Array]:
 
 
 def half_waves(t: Array, count: int) -> list[Array]:
-    """Return a ramp and half waves over the record, 2 to `count` of them, slow ones first."""
-    return [t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(2, count + 1))]
+    """Return t, t² and half waves over the record, 3 to `count` of them, slow ones first: waves have no slope at the
+    ends, so that those of a walk fall with their number's fourth power only beside the two others.
+    """
+    return [t, t * t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(3, count + 1))]
 
 
 def _curvature(s: Course, degree: int) -> Iterator[Column]:
