@@ -190,7 +190,7 @@ def test_a_tracker_that_cannot_go_on_does_not_cut_off_who_else_listens(start):
     def broken(header):
         raise AmbidError("the tracker gave up")
 
-    with Spoiled(RIG) as device:  # more than waits for the tracker: the run is not over when it gives up
+    with Spoiled(RIG) as device:
         with pytest.raises(AmbidError, match="gave up"):
             track_live(
                 device, RIG, course(60.0), start=start, taps=[heard], on_header=broken, on_trouble=told.append,

@@ -4,7 +4,7 @@ covariance is minimised with exact weighted Jacobians, compressed to a triangle 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -442,6 +442,10 @@ def score_statistic(fit: Fit, problem: PredictorProblem, vector: Array) -> float
 def promise_of(rows: tuple[Array, Array] | None) -> float:
     """Return the score statistic of Jacobian and residual, 0 where there are none."""
     return 0.0 if rows is None else directions(rows[0]).explain(rows[1])
+
+
+Freed = Mapping[str, tuple[float, Array]]
+"""What `free_one` says, by fixed parameter."""
 
 
 def free_one(fit: Fit, name: str) -> tuple[float, Array]:

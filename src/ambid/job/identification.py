@@ -291,7 +291,7 @@ def _judged(
     from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.calibration import calibrated, lines_of
-    from ambid.estimation.likelihood import innovations, simulation_error
+    from ambid.estimation.likelihood import free_one, innovations, simulation_error
     from ambid.validation import physical
     from ambid.validation.facts import informed
     from ambid.validation.residuals import fit_of
@@ -308,7 +308,8 @@ def _judged(
     checks = physical.innovation_checks(fit, products, spread, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     spread = replace(spread, disagreement=moved.disagreement() if robust else np.zeros(len(spread.names)))
-    checks |= physical.assumption_checks(fit, spread, delay_how)
+    freed = {name: free_one(fit, name) for name in problem.known}
+    checks |= physical.assumption_checks(fit, spread, freed, delay_how)
     signals = signals_of(bench, problem.model)
     named: list[Cause] = []
     if problem.model.name == "one-axis":
@@ -330,7 +331,9 @@ def _judged(
         before, given = dict(checks), delay_how == "given"
         for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
             named = [
-                c for c in causes(fit, means, thorough=thorough, delay_given=given) if not bent or c.name != "curvature"
+                c
+                for c in causes(fit, means, thorough=thorough, delay_given=given, freed=freed)
+                if not bent or c.name != "curvature"
             ]
             judged = causes_check(named, {**before, "in_time": in_time}, own, robust=robust, record=bench)
             checks = {**before, **judged, "in_time": in_time}

@@ -24,6 +24,7 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import (
     Fit,
+    Freed,
     free_one,
     innovations,
     residual_blocks,
@@ -61,9 +62,7 @@ _GROWING = {
 """Causes whose signals are known but for their sizes."""
 _OPPOSING = {"dead_time", "friction"}
 """Causes that physics gives a sign."""
-_GOES_ON = (
-    0.01  # probability by chance, of waves that are faster, below which a walk goes on beyond those that were taken
-)
+_GOES_ON = 0.01  # probability by chance, of faster waves, below which a walk goes on beyond those that were taken
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
@@ -108,11 +107,14 @@ def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
     return _Look(fit=fit, predictor=predictor, weight=weight_of(fit.covariance), e=e[at], at=at, course=course)
 
 
-def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given: bool = False) -> list[Cause]:
+def causes(
+    fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given: bool = False, freed: Freed | None = None
+) -> list[Cause]:
     """Return the causes that the innovations of model one-axis may have, the strongest first.
 
     `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed;
-    `delay_given`: the delay of the voltage was not estimated.
+    `delay_given`: the delay of the voltage was not estimated; `freed`: what `free_one` says of each fixed value, where
+    that is known.
     """
     look = _look(fit, means)
     if look is None:
@@ -121,7 +123,8 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     spectra = _spectra(look.e @ look.weight.T)
     lines = _lines(look)
     top, chance = _top(spectra, lines) if thorough else (0, 1.0)
-    groups = list(groups_of(course, top * rate_hz / course.t.size, thorough=thorough))
+    top_hz = top * rate_hz / course.t.size
+    groups = list(groups_of(course, top_hz, thorough=thorough))
     if chance < _LINE:
         waves = [w for k in range(max(top - _BAND, 1), top + _BAND + 1) for w in waves_at(k, course.t.size).T[:2]]
         groups += [(f"coloured_{way}", tuple(((way, w),) for w in waves)) for way in ("force", "voltage")]
@@ -130,13 +133,12 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
         groups.append(("input_delay", ((("voltage", later),),)))
     groups += [("line", _waving(lines, course.t.size))] if lines else []
     found = _tested(look, groups)
-    at = top * rate_hz / course.t.size
-    found = [replace(c, size=at) if c.name.startswith("coloured") else c for c in found]
+    found = [replace(c, size=top_hz) if c.name.startswith("coloured") else c for c in found]
     if lines:
         line = found.pop()
         at, p = lines[0].k * rate_hz / course.t.size, min(line.p, lines[0].p)
         found.append(replace(line, channel=lines[0].channel, size=at, p=p))
-    found += _fixed(fit)
+    found += _fixed({name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed)
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
@@ -145,10 +147,9 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     ]
 
 
-def _fixed(fit: Fit) -> Iterator[Cause]:
+def _fixed(freed: Freed) -> Iterator[Cause]:
     """Yield each fixed value as a cause: what freeing it would gain, and move."""
-    for name in fit.problem.known:
-        gain, step = free_one(fit, name)
+    for name, (gain, step) in freed.items():
         if gain > 0.0:
             shift = step[:-1] * np.sqrt(max(1.0 - 1.0 / gain, 0.0))
             p, size = chi_squared_tail(1, gain), step[-1:]
@@ -179,9 +180,9 @@ def extended(
 
     `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new
     ones. None where one of them cannot be taken in, or may stand for a fixed value that is `doubtful`, or the search
-    does not settle. The record is corrected by an
-    error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
-    information of the parameters is what is left beside the sizes.
+    does not settle. The record is corrected by an error of a sensor; a force or a voltage is known to the
+    predictor. Sizes and parameters are found in turn, and the information of the parameters is what is left beside the
+    sizes.
     """
     sure = [c for c in found if c.p < _CHANCE and c.name != "fixed_value"]
     if not sure or fit.problem.n_used > _LONGEST:

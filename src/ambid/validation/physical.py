@@ -24,9 +24,9 @@ from ambid.errors import counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import (
     Fit,
+    Freed,
     Products,
     extend,
-    free_one,
     products,
     search,
     sparse_gain,
@@ -231,12 +231,14 @@ def agreement(fit: Fit) -> Agreement:
     )
 
 
-def assumption_checks(fit: Fit, spread: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
+def assumption_checks(
+    fit: Fit, spread: Uncertainty, freed: Freed, delay_how: Literal["estimated", "given"]
+) -> dict[str, Check]:
     """Check what was taken for known: ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``delay_shown``,
-    ``long_enough``.
+    ``long_enough``. `freed`: what `free_one` says of each fixed value.
     """
     return {
-        "fixed_agree": _fixed_agree(fit),
+        "fixed_agree": _fixed_agree(fit, freed),
         "priors_agree": _priors_agree(fit),
         "delay_in_range": _delay_in_range(fit, delay_how),
         "delay_shown": _delay_shown(fit, delay_how),
@@ -244,13 +246,12 @@ def assumption_checks(fit: Fit, spread: Uncertainty, delay_how: Literal["estimat
     }
 
 
-def _fixed_agree(fit: Fit) -> Check:
+def _fixed_agree(fit: Fit, freed: Freed) -> Check:
     """Score test of each fixed value: would the record, if asked, put it elsewhere?"""
     units = {p.name: p.unit for p in fit.problem.model.parameters}
     worst, most, detail = 1.0, 0.0, "the data agree with every fixed value"
-    for name, value in fit.problem.known.items():
-        statistic, step = free_one(fit, name)
-        p = chi_squared_tail(1, statistic)
+    for name, (statistic, step) in freed.items():
+        value, p = fit.problem.known[name], chi_squared_tail(1, statistic)
         if p < min(worst, P_LEAST):
             detail = (
                 f"the data contradict the fixed {name} = {value:.4g} {units[name]}; a "
