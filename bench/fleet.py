@@ -74,22 +74,22 @@ def beside_a_loop(n: int, folder: Path) -> None:
 
 def time_left(n: int, folder: Path) -> None:
     """Records of 250 to 4,000 samples in no order: what is said to be left after a tenth, and what is."""
-    rng, shares = random.Random(1), list[tuple[float, float, int]]()
+    rng, shares = random.Random(1), list[tuple[float, float, str]]()
     for k in range(n):
         record = ambid.simulate("thesis", duration=rng.choice((0.025, 0.1, 0.4)), seed=k)
         ambid.write_record(record, folder / f"{k:04}.h5")
     begin = time.perf_counter()
 
-    def tick(_: str, done: float | None = None, /) -> None:
-        shares.append((time.perf_counter() - begin, done or 0.0, len(shares) + 1))
+    def tick(said: str, done: float | None = None, /) -> None:
+        shares.append((time.perf_counter() - begin, done or 0.0, said))
 
     fleet([folder / f"{k:04}.h5" for k in range(n)], workers=2, tick=tick)
     end = time.perf_counter() - begin
     print(f"time left of {n} records of different lengths:")
     for part in (0.1, 0.2, 0.5):
-        now, share, count = next(x for x in shares if x[2] >= part * n)
-        print(f"  after {count}, {now:.1f} s: {now / share - now:.1f} s are left, in truth {end - now:.1f} s: "
-              f"ratio {(now / share - now) / (end - now):.2f}")  # fmt: skip
+        now, share, said = shares[int(part * n) - 1]
+        print(f"  after {part * n:g}, {now:.1f} s: {now / share - now:.1f} s are left, in truth {end - now:.1f} s: "
+              f"ratio {(now / share - now) / (end - now):.2f}; {said}")  # fmt: skip
 
 
 def under_kills(kills: int, folder: Path, how: str) -> None:

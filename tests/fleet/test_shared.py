@@ -1,14 +1,9 @@
-"""Several runs on one list: what others have in hand is left to them; time left of a fleet."""
+"""Several runs on one list: what others have in hand is left to them."""
 
-import random
 import threading
 import time
 
-import pytest
-
 import ambid
-from ambid.fleet import pace
-from ambid.fleet.pace import Pace
 from ambid.fleet.run import job_of, run_fleet
 from ambid.ledger import open_ledger
 from ambid.ledger.entry import entry_of, key_of, rig_sha_of, sha_of
@@ -44,30 +39,3 @@ def test_what_another_run_has_in_hand_is_left_to_it(tmp_path):
         assert (run.rows[0].status, run.rows[1].reason) == ("converged", "no")
         with place._reading() as c:
             assert c.exec_driver_sql("SELECT count(*) FROM claim").scalar_one() == 0
-
-
-@pytest.mark.parametrize("by_size", [0.0, 1e-3])
-@pytest.mark.parametrize("order", ["as they come", "small first"])
-def test_time_left_is_right_after_a_tenth(monkeypatch, by_size, order):
-    """Two workers, 200 records of different lengths, of which a process's first takes 3 s longer."""
-    rng = random.Random(1)
-    sizes = [rng.choice((100, 1000, 5000)) * rng.uniform(0.8, 1.2) for _ in range(200)]
-    sizes = sorted(sizes) if order == "small first" else sizes
-    now = 0.0
-    monkeypatch.setattr(pace.time, "monotonic", lambda: now)
-    over, free_at, answers = Pace(sizes, 2), [1.0, 1.5], []
-    for k, size in enumerate(sizes):
-        worker = free_at.index(min(free_at))
-        seconds = (0.3 + by_size * size) * rng.uniform(0.8, 1.2) + (3.0 if k < 2 else 0.0)
-        free_at[worker] += seconds
-        answers.append((free_at[worker], size, seconds, k < 2))
-    end, told, work = max(free_at), [], 0.0
-    for now, size, seconds, first in sorted(answers):
-        over.over(size)
-        over.take(size, seconds, first=first)
-        work += 0.3 + by_size * size
-        if work > 0.1 * sum(0.3 + by_size * x for x in sizes) and not told:
-            told.append(over.left_s() / (end - now))
-            assert over.share() == pytest.approx(now / (now + over.left_s()))
-    assert told[0] == pytest.approx(1.0, abs=0.3)
-    assert over.left_s() == pytest.approx(0.0, abs=1e-9)

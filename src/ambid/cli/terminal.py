@@ -122,7 +122,8 @@ class _Display:
             while not self._done.wait(0.1):
                 elapsed, share = time.monotonic() - self._begin, self._share
                 text = f"{elapsed:.0f} s" + (f", {100 * share:.0f} %" if self._told else "")
-                text += f", {in_words(elapsed * (1.0 - share) / share)}" if share else ""
+                if share and not self._stage.endswith(" left"):  # it tells that itself
+                    text += f", {in_words(elapsed * (1.0 - share) / share)}"
                 watch.show(self._stage, share or None, text)
 
 

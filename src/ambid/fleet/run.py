@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from ambid.errors import AmbidError, CircumstanceError, choices, counted
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
-from ambid.fleet.pace import Pace
+from ambid.fleet.pace import Pace, in_order
 from ambid.fleet.pool import LIMIT_S, Done, cores, work
 from ambid.fleet.sources import Item, Rigs, fit_for_ledger, items, started_in, undated
 from ambid.job.results import result_of
@@ -358,7 +358,8 @@ class _Run:
         failed, others = self.counts["failed"], 0 if self._leases is None else self._leases.others
         rate = n / max(time.monotonic() - self._begin, 1e-9)
         beside = f", {counted(others, 'other run')} beside" if others else ""
-        say(f"{rate:.3g} records/s{f', {failed} failed' if failed else ''}{beside}", self.pace.share(1 + others))
+        left, share = self.pace.said(1 + others)
+        say(f"{rate:.3g} records/s{f', {failed} failed' if failed else ''}{beside}{left}", share)
 
     def take(self, done: Done) -> None:
         """Take the answer to a record."""
@@ -436,7 +437,8 @@ def run_fleet(
     n_workers = local or workers or cores()
     store = None if ledger is None else open_ledger(ledger)
     try:
-        run = _Run(job_made, fleet, store, again=again, workers=n_workers)
+        order = in_order([item.size for item in fleet])
+        run = _Run(job_made, [fleet[k] for k in order], store, again=again, workers=n_workers)
 
         def wished() -> bool:
             run.alive()
@@ -463,7 +465,7 @@ def run_fleet(
     return FleetRun(
         job=job_made.name, settings=job_made.said, ledger=None if store is None else store.shown,
         workers=n_workers, seconds=time.monotonic() - begin, records=len(fleet), units=run.units,
-        rows=tuple(run.rows[at] for at in sorted(run.rows)),
+        rows=tuple(run.rows[at] for at in sorted(run.rows, key=order.__getitem__)),
     )  # fmt: skip
 
 
