@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from ambid.estimation.predictor import gain_derivatives, predictor_gain, solve_lyapunov, stable
+from ambid.estimation.predictor import gain_derivatives, predictor_gain, predictor_gains, solve_lyapunov, stable
 from tests.bearing.benches import problem_of, run
 from tests.estimation.reference import STEP, riccati, sampled
 
@@ -104,3 +104,13 @@ def test_a_gain_that_is_far_off_does_not_settle_and_warns_of_nothing():
     A, C, one = np.array([[0.5, 0.1], [0.0, 0.4]]), np.array([[0.0, 0.0]]), np.eye(2)
     assert _newton(A, C, one, np.eye(1), np.full((2, 1), 1e200)) is None  # its covariance is no number
     assert _newton(A, C, one, np.eye(1), np.zeros((2, 1))) is not None
+
+
+def test_a_start_whose_pole_runs_away_leaves_the_others_their_gains():
+    """Its rough covariance is 1e274: products of it overflow."""
+    away = [[1.49e129, -3.104e134, -1.83e135], [9.69e132, -2.0197e138, -1.19e139], [-1.568e135, 3.266e140, 1.926e141]]
+    a = np.array([away, np.diag([0.9, 0.8, 0.7])])
+    c, q, r = np.eye(3)[[0, 2]], np.array([np.zeros((3, 3)), 0.01 * np.eye(3)]), np.array([np.eye(2)] * 2)
+    gains, led = predictor_gains(a, c, q, r)
+    assert led.tolist() == [False, True]
+    np.testing.assert_allclose(gains[1], predictor_gain(a[1], c, q[1], r[1]).K, rtol=1e-9)

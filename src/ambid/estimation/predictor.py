@@ -177,6 +177,7 @@ def all_scales(
 _KRONECKER = 6  # states up to which a Lyapunov equation is solved as a linear one: small systems are quicker so
 _DOUBLINGS = 60
 _ROUNDING = 1e-16
+_HUGE = 1e100  # of a covariance in scaled units, whose products would overflow: a pole of the plant runs away
 _STEP = 1e-7  # of a Newton step, relative: convergence is quadratic, which leaves an error of about 1e-14
 
 
@@ -197,7 +198,7 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
     P = None if K is None else _newton(A, C, Q, R, K)
     if P is None:
         rough = _stable_subspace(A, C, Q, R)
-        K = None if rough is None else _gain_of(A, C, rough, R)
+        K = None if rough is None or np.abs(rough).max() > _HUGE else _gain_of(A, C, rough, R)
         P = None if K is None or not stable(A - K @ C) else _newton(A, C, Q, R, K, rough)
     if P is None:
         from scipy.linalg import solve_discrete_are
@@ -213,21 +214,26 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
 
 
 def predictor_gains(A: Array, C: Array, Q: Array, R: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the predictor gains (n_plants, n_states, n_outputs) of several plants `A`, `Q` with one `C`, `R`, and for
+    """Return the predictor gains (n_plants, n_states, n_outputs) of several plants `A`, `Q`, `R` with one `C`, and for
     which of them the quick way leads to one.
     """
+    gains, settled = np.zeros((*A.shape[:-1], C.shape[0])), np.zeros(A.shape[0], dtype=bool)
     P = _stable_subspace(A, C, Q, R)
     if P is None:
-        return np.zeros((*A.shape[:-1], C.shape[0])), np.zeros(A.shape[0], dtype=bool)
-    K = _gain_of(A, C, P, R)
-    started = np.abs(np.linalg.eigvals(A - K @ C)).max(axis=-1) < 1.0
+        return gains, settled
+    led = np.flatnonzero(np.abs(P).max(axis=(1, 2)) < _HUGE)
+    K = _gain_of(A[led], C, P[led], R[led])
+    start = np.abs(np.linalg.eigvals(A[led] - K @ C)).max(axis=-1) < 1.0
+    led, K = led[start], K[start]
+    A, Q, R, P, near = A[led], Q[led], R[led], P[led], np.zeros(led.size, dtype=bool)
     for _ in range(8):
+        if np.all(near):
+            break
         before, P = P, solve_lyapunov(A - K @ C, Q + K @ R @ _turned(K))
         K = _gain_of(A, C, P, R)
-        settled = np.abs(P - before).max(axis=(1, 2)) <= _STEP * np.abs(P).max(axis=(1, 2))
-        if np.all(settled | ~started):
-            break
-    return K, started & settled
+        near = np.abs(P - before).max(axis=(1, 2)) <= _STEP * np.abs(P).max(axis=(1, 2))
+    gains[led], settled[led] = K, near
+    return gains, settled
 
 
 def _turned(a: NDArray[Any]) -> NDArray[Any]:
