@@ -98,16 +98,17 @@ def plausible(e: KnownEstimate, now: float) -> bool:
 
 
 def missing(
-    h: History, rule: RecordRule, series: Sequence[Series], failures: Sequence[Failure], now: float
+    h: History, rule: RecordRule, found: Pauses, series: Sequence[Series], failures: Sequence[Failure], now: float
 ) -> Iterator[Alarm]:
-    """Yield alarms about the records of one bearing; `series`: parameters that rules watch."""
+    """Yield alarms about the records of one bearing; `found`: pauses of the plausible ones, `series`: parameters that
+    rules watch.
+    """
     good = [e for e in h.estimates if plausible(e, now)]
     odd = [e for e in h.estimates if not plausible(e, now)]
     if odd:
         which = listed([f"{e.record or 'a record'} of {day(e.taken_at)}" for e in odd], _SHOWN)
         end = good[-1].taken_at if good else now
         yield alarm_of(h.bearing, "date", odd[0].taken_at, end, f"taken at an impossible time: {which}")
-    found = pauses(np.array([e.taken_at for e in good]), rule)
     if good and now - good[-1].taken_at > found.overdue_s:
         last = good[-1].taken_at
         text = f"no estimate for {span(now - last)}{_usual(found)}"
@@ -185,15 +186,17 @@ def unusable(
         )  # fmt: skip
 
 
-def never(bearing: str, rule: RecordRule, failures: Sequence[Failure], now: float) -> Iterator[Alarm]:
-    """Yield alarms about a bearing that has given no estimate yet: its records fail, or none has come for long."""
+def never(
+    bearing: str, rule: RecordRule, failures: Sequence[Failure], at: float, overdue_s: float, now: float
+) -> Iterator[Alarm]:
+    """Yield alarms about a bearing that has given no estimate yet: its records fail, or none has come for long; `at`:
+    when the last one failed, `overdue_s`: after which the next is overdue.
+    """
     yield from unusable(bearing, rule, (), failures, now)
-    at = np.array(sorted(f.failed_at for f in failures))
-    overdue = pauses(at, rule).overdue_s
-    if now - at[-1] > overdue:
+    if now - at > overdue_s:
         reason = max(failures, key=lambda f: f.failed_at).reason
-        text = f"never an estimate, and no record for {span(now - at[-1])}; the last one failed: {reason}"
-        yield alarm_of(bearing, "stale", float(at[-1]), now, text, raised=float(at[-1] + overdue))
+        text = f"never an estimate, and no record for {span(now - at)}; the last one failed: {reason}"
+        yield alarm_of(bearing, "stale", at, now, text, raised=at + overdue_s)
 
 
 def _unseen(h: History, s: Series, rule: RecordRule, now: float) -> Iterator[Alarm]:

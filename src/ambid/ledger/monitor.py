@@ -161,18 +161,25 @@ def watch(
             watched += [s] * bool(own)
             alarms += [a for rule in own for a in _alarms(h, s, rule, silences, now)]
             trends += trend_of(h, s, own)
-        rule = records.get(h.bearing, records.get(""))
+        rule, own_failed = records.get(h.bearing, records.get("")), failed.pop(h.bearing, [])
+        sound = [e for e in h.estimates if plausible(e, now)]
+        found = pauses(np.array([e.taken_at for e in sound]), rule or RecordRule())
         if rule is not None:
-            alarms += missing(h, rule, watched, failed.get(h.bearing, ()), now)
-        states.append(_now(h, rule or RecordRule(), len(failed.pop(h.bearing, ())), now))
+            alarms += missing(h, rule, found, watched, own_failed, now)
+        success = [e.taken_at for e in sound if e.verdict != "unusable"]
+        latest = sound[-1].taken_at if sound else None
+        states.append(Now(
+            bearing=h.bearing, verdict=h.estimates[-1].verdict, latest=latest, heard=latest, overdue_s=found.overdue_s,
+            success=success[-1] if success else None, failures=len(own_failed),
+        ))  # fmt: skip
     for name, of in sorted(failed.items()):  # records of these never gave an estimate
         rule, at = records.get(name, records.get("")), np.array(sorted(f.failed_at for f in of))
+        last, overdue_s = float(at[-1]), pauses(at, rule or RecordRule()).overdue_s
         states.append(Now(
-            bearing=name, verdict="", latest=None, success=None, heard=float(at[-1]), failures=len(of),
-            overdue_s=pauses(at, rule or RecordRule()).overdue_s,
+            bearing=name, verdict="", latest=None, success=None, heard=last, overdue_s=overdue_s, failures=len(of),
         ))  # fmt: skip
         if rule is not None:
-            alarms += never(name, rule, of, now)
+            alarms += never(name, rule, of, last, overdue_s, now)
     if records:
         alarms += misnamed(bearings, now)
         alarms = list(of_one_bearing(alarms, bearings))
@@ -184,17 +191,6 @@ def watch(
         bearings=tuple(x.bearing for x in states), rules=tuple(own_rules), records=tuple(records.values()),
         alarms=tuple(sorted(alarms, key=lambda a: (not a.open, a.cleared is not None, a.raised, a.bearing))),
         trends=tuple(trends), states=tuple(states),
-    )  # fmt: skip
-
-
-def _now(h: History, rule: RecordRule, failures: int, now: float) -> Now:
-    sound = [e for e in h.estimates if plausible(e, now)]
-    success = [e.taken_at for e in sound if e.verdict != "unusable"]
-    latest = sound[-1].taken_at if sound else None
-    return Now(
-        bearing=h.bearing, verdict=h.estimates[-1].verdict, latest=latest, heard=latest,
-        success=success[-1] if success else None, failures=failures,
-        overdue_s=pauses(np.array([e.taken_at for e in sound]), rule).overdue_s,
     )  # fmt: skip
 
 
