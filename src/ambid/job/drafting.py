@@ -219,10 +219,8 @@ def info(
     record : file, Record, DataFrame, Dataset or dict of arrays
     rig : Rig, path, dict or TOML text, optional
         Names and calibrates the channels; what the inputs explain then does not count as noise.
-    rate_hz, gaps, units : optional
+    rate_hz, gaps, units, layout : optional
         As `ambid.identify`.
-    layout : Mapping of str to str, optional
-        What a file leaves open, as `ambid.record.read_record` takes it.
 
     Returns
     -------

@@ -95,16 +95,8 @@ def fit(
     at_rest : bool, optional
         All signals are zero before the first sample: no offsets and initial states are estimated. For polynomial
         structures; a warning tells if the record contradicts it.
-    from_s, to_s : float, optional
-        Part of every record to fit, in s.
-    rate_hz : float, optional
-        Sampling rate of records without time, Hz.
-    gaps : {"error", "interpolate", "cut"}, optional
-        What to do about missing values.
-    units : Mapping of str to str, optional
-        Unit by column, for tables in memory.
-    layout : Mapping of str to str, optional
-        What files leave open, as `ambid.record.read_record` takes it.
+    from_s, to_s, rate_hz, gaps, units, layout : optional
+        As `ambid.identify`, of every record.
     validate : as `records`, optional
         A further record to validate on, all of it; `ambid.validate` takes a part.
     tick : callable, optional

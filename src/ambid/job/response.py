@@ -101,12 +101,8 @@ def frf(
     delay : float or "auto", s, optional
         Of the inputs. Default: 0 for the black-box models, the rig's for physical parameters. "auto" estimates it (not
         for a state space).
-    from_s, to_s : float, optional
-        Part of the record to use, in s.
-    rate_hz, gaps, units : optional
+    from_s, to_s, rate_hz, gaps, units, layout : optional
         As `ambid.identify`.
-    layout : Mapping of str to str, optional
-        What the file leaves open, as `ambid.read_record`.
     tick : callable, optional
         Called with the name of the present stage; may raise to interrupt.
 

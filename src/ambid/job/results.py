@@ -121,13 +121,13 @@ def _fit(document: Mapping[str, Any], path: str) -> AnyFit:
     return nonlinear_fit_from_json(document, where) if nonlinear else fit_from_json(document, where)
 
 
-def _whole(module: str, name: str, job: str) -> Callable[[Mapping[str, Any], str], Any]:
-    """Return a reader of a result whose file has all its fields by name, or that reads what stands beside it too."""
+def _whole(module: str, name: str, job: str, *, own: str = "") -> Callable[[Mapping[str, Any], str], Any]:
+    """Return a reader of a result whose file has all its fields by name; `own`: the reader of one that has not."""
 
     def read(document: Mapping[str, Any], path: str) -> Any:
         kind = getattr(import_module(f"ambid.{module}"), name)
-        if hasattr(kind, "of_file"):
-            return kind.of_file(document, path)
+        if own:
+            return getattr(kind, own)(document, path)
         return read_whole(lambda: read_as(kind, document), f"{name.lower()} {path}", name.lower(), job)
 
     return read
@@ -153,7 +153,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     _EXPERIMENT: _whole("control.experiment", "Experiment", "design_experiment"),
     "ambid.design/1": _whole("control.design", "Design", "design_controller"),
     "ambid.history/1": _whole("ledger.history", "History", "history"),
-    "ambid.commission/1": _whole("job.commissioning", "Commissioned", "commission"),
+    "ambid.commission/1": _whole("job.commissioning", "Commissioned", "commission", own="of_file"),
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
     "ambid.agreement/1": _whole("validation.agreement", "Agreement", "compare"),
     "ambid.acceptance/1": _whole("control.acceptance", "Acceptance", "accept"),

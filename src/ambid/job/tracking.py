@@ -106,14 +106,8 @@ def track(
         Replay as fast as possible, or as the record was taken.
     flags : sequence of (float, str), optional
         Flags that an operator sets, with their times in s of record: "track", "hold", "accept" or "revert".
-    from_s, to_s : float, optional
-        Part of the record to use, s.
-    rate_hz : float, optional
-        Sampling rate of a record without time.
-    units : Mapping of str to str, optional
-        Unit by column, for tables in memory.
-    layout : Mapping of str to str, optional
-        What the file leaves open, as `ambid.read_record`, beside the rig's ``record.layout``.
+    from_s, to_s, rate_hz, units, layout : optional
+        As `ambid.identify`.
     on_header, on_line : callable, optional
         Called once before the first line, and with each line; flags that `on_line` returns are set.
     keep : bool, optional

@@ -223,7 +223,8 @@ def signed_panel(axes: Axes, frequency_hz: Array, values: Mapping[str, Array], n
     scale, unit = prefixed(least, unit)
     for axis, x in values.items():
         axes.plot(frequency_hz, x / scale, label=axis if len(values) > 1 else None)
-    axes.set_yscale("symlog", linthresh=least / scale, linscale=2.0)
+    decade = (1.0 + 1e-9) * 10.0 ** round(math.log10(max(least / scale, 1e-300)))  # just above: no tick below
+    axes.set_yscale("symlog", linthresh=decade, linscale=2.0)
     axes.axhline(0.0, color=BOUND, linewidth=0.6)
     log_axis(axes.xaxis, float(frequency_hz[0]), float(frequency_hz[-1]))
     axes.set_xlabel("frequency [Hz]")
