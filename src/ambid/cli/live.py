@@ -1,6 +1,5 @@
-"""A run of the tracker as it is followed: written, counted, shown, and stopped without losing what it found.
-
-`Follower` takes the callbacks of the job; a thread of its own draws, so that the tracker never waits for a terminal.
+"""A run of the tracker as it is followed: written, counted, told on a line, and stopped without losing what it found.
+`Follower` takes the callbacks of the job.
 """
 
 from __future__ import annotations
@@ -8,31 +7,27 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from threading import Event as Signal
-from threading import Thread
 from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from ambid.cli.interrupts import INTERRUPTED, interrupts, signals
 from ambid.cli.output import Outputs, end, json_path
-from ambid.cli.terminal import progress
-from ambid.errors import AmbidError
+from ambid.cli.terminal import Watch, watching
+from ambid.errors import AmbidError, counted
 
 if TYPE_CHECKING:
-    from rich.console import Group
-
     from ambid.recursive.lines import Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_figures import TrackHistory
     from ambid.tracking.lines_file import LiveState
 
 Flag = Literal["track", "hold", "accept", "revert"]
 
-_FRAME_S = 0.1  # between two pictures at the least
-_SHARE = 0.02  # of the time may go into drawing
+_TELL_S = 0.1  # how often at most it is told where the run is
+_QUIET_S = 1.0  # a start that takes less shows nothing
 
 
 class Follower:
@@ -58,10 +53,8 @@ class Follower:
         self._live = sys.stderr.isatty() and (self.table or not sys.stdout.isatty())
         self._keep, self._real_time = keep, real_time
         self._stop: int | None = None
-        self._begin_wall = 0.0
-        self._before_header = ExitStack()
-        self._say: Callable[[str], object] = str  # says nothing until there is a line of progress
-        self._picture: _Picture | None = None
+        self._begin_wall = self._told = time.perf_counter()
+        self._watch: Watch | None = None
 
     def run(self, job: Callable[[], Track]) -> None:
         """Let the job, which has the callbacks of this object, run to its end or until it is stopped.
@@ -73,8 +66,8 @@ class Follower:
         from ambid.recursive.lines import Track
 
         found: TrackSummary | None = None
-        with self._before_header, signals(self._signalled):
-            self._say = self._before_header.enter_context(progress("track"))
+        with signals(self._signalled), watching() as watch:
+            self._watch = watch if self._live else None
             try:
                 found = job().totals
             except BaseException as error:
@@ -84,10 +77,6 @@ class Follower:
                 if self.state is None:
                     raise
                 self.code = self._stop or INTERRUPTED
-            finally:
-                if self._picture is not None:
-                    self._picture.end()
-                    self._picture = None
         if self.state is None:
             return
         if found is None:
@@ -150,24 +139,19 @@ class Follower:
         del done
         if self._stop is not None:
             raise KeyboardInterrupt
-        if self.state is None:
-            self._say(stage)
+        if self.state is None and self._watch is not None and time.perf_counter() - self._begin_wall > _QUIET_S:
+            self._watch.show(stage, None, "")
 
     def on_header(self, header: TrackHeader) -> None:
-        """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older
-        one.
-        """
+        """Take the header; the file begins with the first line, so that a refusal leaves an older one."""
         from ambid.tracking.lines_file import LiveState
 
-        self._before_header.close()
         if self._keep:
             from ambid.report.track_figures import TrackHistory
 
             self.history = TrackHistory(header)
         self._begin_wall = time.perf_counter()
         self.state = LiveState(header)
-        if self._live:
-            self._picture = _Picture(self._view)
 
     def on_line(self, line: TrackLine) -> None:
         """Take a line: written, counted and kept; drawing looks at it later."""
@@ -181,6 +165,9 @@ class Follower:
         self.state.add(line)
         if self.history is not None:
             self.history.add(line)
+        if self._watch is not None and time.perf_counter() - self._told > _TELL_S:
+            self._told = time.perf_counter()
+            self._watch.show("track", *self._where(self.state, line))
         if self._stop is not None:
             raise KeyboardInterrupt
 
@@ -196,54 +183,14 @@ class Follower:
             raise KeyboardInterrupt
         self._stop = 128 + number
 
-    def _view(self, ascii_only: bool) -> Group | None:
-        """Draw what is shown now; None before the first line. Called by the drawing thread."""
-        from ambid.report.track import live_view
-
-        state = self.state
-        if state is None or state.line is None:
-            return None
-        wall = time.perf_counter() - self._begin_wall
-        behind = state.lag_s
+    def _where(self, state: LiveState, line: TrackLine) -> tuple[float | None, str]:
+        """Return which part of the record is over, and in words where the run is."""
+        length, behind = state.length_s, state.lag_s
         if behind is None and self._real_time:
-            behind = wall - (state.line.t - state.begin_s)
-        return live_view(state, wall_s=wall, behind_s=behind, ascii_only=ascii_only)
-
-
-class _Picture:
-    """The thread that draws the live view."""
-
-    def __init__(self, view: Callable[[bool], Group | None]) -> None:
-        self._view, self._done = view, Signal()
-        self._failure: Exception | None = None
-        self._thread = Thread(target=self._run, name="live view", daemon=True)
-        self._thread.start()
-
-    def end(self) -> None:
-        self._done.set()
-        self._thread.join()
-        if self._failure is not None:
-            print(f"ambid: the live view ended early: {self._failure}", file=sys.stderr)
-
-    def _run(self) -> None:
-        try:
-            self._draw()
-        except Exception as failure:  # what is shown may fail; the run goes on
-            self._failure = failure
-
-    def _draw(self) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
-        console = Console(stderr=True)
-        ascii_only = console.options.ascii_only
-        # standard output is left alone: lines of JSON may go there
-        shown = Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False, redirect_stderr=False)
-        with shown as live:
-            wait_s = 0.0
-            while not self._done.wait(wait_s):
-                begin = time.perf_counter()
-                view = self._view(ascii_only)
-                if view is not None:
-                    live.update(view, refresh=True)
-                wait_s = max(_FRAME_S, (time.perf_counter() - begin) / _SHARE)
+            behind = self._told - self._begin_wall - (line.t - state.begin_s)
+        words = [f"{line.t:.2f} s, {line.state}, model error {line.error:.3g} of {state.header.limit:g}"]
+        if state.tally.open_changes:
+            words.append(counted(len(state.tally.open_changes), "open change"))
+        if behind is not None:
+            words.append(f"{1e3 * max(behind, 0.0):.0f} ms behind")
+        return min((line.t - state.begin_s) / length, 1.0) if length else None, ", ".join(words)

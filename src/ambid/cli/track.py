@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def command(v: Values) -> None:
     """Track the physical parameters of a bench through a record, as beside a running machine.
 
-    On a terminal a live view shows parameters, error, state and decisions; Ctrl-C ends in order.
+    A line shows where it is; 'ambid console' shows everything live. Ctrl-C ends in order.
     """
     from ambid.cli.live import Follower
     from ambid.job.following import check_settings

@@ -1,4 +1,4 @@
-"""A track for people: the table of its end, and the live view, a pure function from what is known now to rich."""
+"""A track for people: the table of its end, its changes and decisions, and how fast it was."""
 
 from __future__ import annotations
 
@@ -19,20 +19,11 @@ from ambid.report.track_figures import TrackHistory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from rich.console import Group
-    from rich.table import Table as Grid
 
     from ambid.report.track_figures import Truth
-    from ambid.tracking.lines_file import LiveState
 
-STATE_STYLES = {"tracking": "bold green", "changed": "bold red", "hold": "bold cyan", "frozen": "bold yellow"}
-_BLOCKS, _PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*%#"
 _BAD = ("change", "reverted", "refused", "disturbed")
 _MOST = 20  # events that are listed one by one
-_BAR = 25  # columns of a bar
-_SPARK = 40  # columns of the error's recent past
-_DECISIONS = 6
-LATE_S = 0.2  # a lag beyond which is shown in red, s
 
 
 def track_document(
@@ -205,147 +196,3 @@ def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> s
         f"{rate / 1e6:.3g} million" if rate >= 1e6 else f"{rate / 1e3:.3g} thousand" if rate >= 1e3 else f"{rate:.3g}"
     )
     return f"{pace} samples/s, {seconds_of_record / computing_s:.3g} times real time"
-
-
-Parts = list[str | tuple[str, str]]  # of a line, those with a style of their own as pairs
-
-
-def live_view(state: LiveState, *, wall_s: float, behind_s: float | None = None, ascii_only: bool = False) -> Group:
-    """Make what is shown of a run that has a line.
-
-    `wall_s`: since tracking began, s; `behind_s`: from a sample to what is decided on it in real time, s; `ascii_only`:
-    for a terminal whose encoding has no blocks. Returns about 80 columns wide.
-    """
-    from rich.console import Group
-    from rich.text import Text
-
-    line = state.line
-    assert line is not None
-    after = [_error(state, line, ascii_only), _counts(state, line, wall_s), *_decisions(state)]
-    head = _head(state, line, behind_s, ascii_only)
-    first, *rest = (Text.assemble(*x, no_wrap=True, overflow="ellipsis") for x in (head, *after))
-    return Group(first, Text(), _parameters(state, line, ascii_only), Text(), *rest)
-
-
-def _head(state: LiveState, line: TrackLine, behind_s: float | None, ascii_only: bool) -> Parts:
-    h, length = state.header, state.length_s
-    mark = "*" if ascii_only else "●"
-    word = (f"{mark} {line.state:<9}", STATE_STYLES[line.state])
-    parts: Parts = [(str(h.record.get("file") or "record"), "bold"), f": model {h.model}, {h.method}\n", word]
-    parts.append(f" t {line.t:.2f} s")
-    if length:
-        share = min(max((line.t - state.begin_s) / length, 0.0), 1.0)
-        full = round(20 * share)
-        on, off = ("#", ".") if ascii_only else ("█", "░")
-        parts.append(f" of {state.begin_s + length:.4g} s  {on * full}{off * (20 - full)} {100 * share:.0f} %")
-    if behind_s is not None:
-        parts.append((f"  {sized(max(behind_s, 0.0), 's')} behind", "bold red" if behind_s > LATE_S else ""))
-    return parts
-
-
-def _parameters(state: LiveState, line: TrackLine, ascii_only: bool) -> Grid:
-    from rich.table import Table as Grid
-    from rich.text import Text
-
-    table = Grid.grid(padding=(0, 2, 0, 0))
-    for column in range(5):
-        table.add_column(justify="right" if column == 2 else "left", no_wrap=True)
-    table.add_row("", "value ± sd", "from start", "95 % interval", "", style="dim")
-    numbers, ranges = {**line.parameters, **line.extra}, state.widened()
-    for name, v in numbers.items():
-        start = state.header.start.get(name)
-        low, high = ranges.get(name, (math.nan, math.nan))
-        bar = interval_bar(v.value, v.sd, math.nan if start is None else start.value, low, high, ascii_only=ascii_only)
-        style = "yellow" if v.stale else ""
-        table.add_row(
-            Text(name, style="bold"),
-            Text(value_words(v, state.header.units.get(name, ""))[0], style=style),
-            Text(change_words(v, start), style=style),
-            Text(bar, style="yellow" if v.stale else "cyan"),
-            Text("STALE", style="bold yellow") if v.stale else Text(),
-        )
-    return table
-
-
-def interval_bar(
-    value: float, sd: float, start: float, low: float, high: float, *, width: int = _BAR, ascii_only: bool = False
-) -> str:
-    """Draw an interval between two ends: the value, its 95 % interval, and where it started.
-
-    `low`, `high`: the ends; `width`: columns. Returns of `width` letters; blank where there is nothing to draw. An
-    arrow stands where the value is beyond an end.
-    """
-    if not (math.isfinite(value) and high > low):
-        return " " * width
-    line, dot, mark, empty, before, behind = "-o|.<>" if ascii_only else "━●│·◀▶"
-
-    def column(x: float) -> int:
-        return math.floor((x - low) / (high - low) * (width - 1) + 0.5)
-
-    cells = [empty] * width
-    reach = NORMAL_95 * sd if math.isfinite(sd) else high - low
-    for k in range(max(column(value - reach), 0), min(column(value + reach), width - 1) + 1):
-        cells[k] = line
-    if math.isfinite(start) and 0 <= column(start) < width:
-        cells[column(start)] = mark
-    place = column(value)
-    if place < 0:
-        cells[0] = before
-    elif place >= width:
-        cells[-1] = behind
-    else:
-        cells[place] = dot
-    return "".join(cells)
-
-
-def sparkline(values: Sequence[float], limit: float, *, width: int = _SPARK, ascii_only: bool = False) -> str:
-    """Draw recent values as blocks, the largest of each stretch; half height is the limit.
-
-    `values`: naN where one is not known; `limit`: positive; `width`: most columns. Returns a letter for each stretch, a
-    blank for one without values; at twice the limit it is full.
-    """
-    blocks = _PLAIN_BLOCKS if ascii_only else _BLOCKS
-    n = len(values)
-    columns = min(width, n)
-    letters = []
-    for k in range(columns):
-        part = [x for x in values[k * n // columns : (k + 1) * n // columns] if not math.isnan(x)]
-        if not part:
-            letters.append(" ")
-            continue
-        level = min(max(part) / (2 * limit), 1.0)
-        letters.append(blocks[min(int(level * len(blocks)), len(blocks) - 1)])
-    return "".join(letters)
-
-
-def _error(state: LiveState, line: TrackLine, ascii_only: bool) -> Parts:
-    error, limit, errors = line.error, state.header.limit, state.errors
-    text = "  ?  " if math.isnan(error) else f"{error:5.3g}"
-    over = (_PLAIN_BLOCKS if ascii_only else _BLOCKS)[4:]
-    spark = sparkline(errors, limit, ascii_only=ascii_only)
-    return [
-        "model error ",
-        (text, "bold red" if error > limit else "bold green"),
-        f"  limit {limit:g}  ",
-        *((letter, "red" if letter in over else "green") for letter in spark),
-        (f"  last {sized(len(errors) * state.header.every_s, 's')}" if len(errors) > 1 else "", "dim"),
-    ]
-
-
-def _counts(state: LiveState, line: TrackLine, wall_s: float) -> Parts:
-    done, tally = line.t - state.begin_s, state.tally
-    parts: Parts = [f"{tally.updates} updates, {tally.rejected_samples} samples rejected"]
-    if tally.open_changes:
-        parts.append((f", {counted(len(tally.open_changes), 'open change')}", "bold red"))
-    speed = speed_words(round(done * state.header.rate_hz), done, wall_s)
-    return [*parts, (f"\n{speed}", "dim")] if speed else parts
-
-
-def _decisions(state: LiveState) -> list[Parts]:
-    events = state.events
-    lines: list[Parts] = [[]] if events else []
-    for e in events[-_DECISIONS:]:
-        who = f" {e.parameter}" if e.parameter else ""
-        what = (f"{e.kind}{who}: ", "bold red" if e.kind in _BAD else "bold")
-        lines.append([(f"{e.t:10.3f} s  ", "dim"), what, " ".join(e.why.split())])
-    return lines

@@ -346,7 +346,6 @@ def _event(e: Mapping[str, Any]) -> dict[str, Any]:
     return {"t": None, "why": "", **e}
 
 
-_RECENT = 600  # lines whose error is shown
 _TOLD = 200  # events that are kept
 _NOTABLE = ("change", "disturbed", "reverted", "operator")  # told one by one; of the others the last of its kind
 
@@ -365,15 +364,12 @@ class LiveState:
         self._notable: deque[Event] = deque(maxlen=_TOLD)
         self._latest: dict[str, Event] = {}
         self._unanswered = False
-        self._errors: deque[float] = deque(maxlen=_RECENT)
-        self._ranges: dict[str, tuple[float, float]] = {}
 
     def add(self, line: TrackLine) -> None:
         """Take a line."""
         if self.line is None:
             self.begin_s = line.t - self.header.every_s
         self.tally.add(line)
-        self._errors.append(line.error)
         for event in line.events:
             if event.kind in _NOTABLE:
                 self._unanswered = self._unanswered or event.kind == "change"
@@ -393,26 +389,10 @@ class LiveState:
         return tuple(sorted([*notable, *routine], key=lambda e: e.t))
 
     @property
-    def errors(self) -> tuple[float, ...]:
-        """Model errors of recent lines, oldest first."""
-        return _copy_of(self._errors)
-
-    @property
     def length_s(self) -> float | None:
         """Length of the record, s; None where it is not known."""
         samples = self.header.record.get("samples")
         return samples / self.header.rate_hz if isinstance(samples, (int, float)) else None
-
-    def widened(self) -> Mapping[str, tuple[float, float]]:
-        """Return between which ends each number is shown, SI: they stay until an interval passes them."""
-        numbers = {} if self.line is None else {**self.line.parameters, **self.line.extra}
-        for name, v in numbers.items():
-            reach = max(2.5 * v.sd, 0.02 * abs(v.value))
-            low, high = v.value - reach, v.value + reach
-            if low < high < math.inf:
-                before = self._ranges.get(name, (low - reach, high + reach))
-                self._ranges[name] = (min(before[0], low), max(before[1], high))
-        return dict(self._ranges)
 
 
 def _copy_of(things: deque[T]) -> tuple[T, ...]:
