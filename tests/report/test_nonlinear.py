@@ -20,7 +20,7 @@ from ambid.report.fit import (
     setting_text,
     term_parts,
 )
-from ambid.report.fit_figures import bars_of, fit_overview, traces_of
+from ambid.report.fit_figures import fit_overview, traces_of
 from ambid.validation.fits import judge
 from tests.validation.nonlinear.plants import Static, io, squared, static_fit
 
@@ -81,8 +81,6 @@ def test_numbers_with_a_meaning_are_listed_and_weights_are_not(fit: NonlinearFit
     ]
     assert lines_of(named_parts, replace(few, model=Renamed(names=("a21", "unit 1: u"), theta=np.ones(2)))) == []
     assert lines_of(named_parts, replace(fit, details={})) == []
-    assert bars_of(few) is not None
-    assert bars_of(replace(few, model=Renamed(names=("a21", "y: unit 1"), theta=np.ones(2)))) is None
 
 
 def test_a_schedule_is_shown_at_its_ends_and_in_the_middle(fit: NonlinearFit) -> None:
@@ -132,12 +130,10 @@ def test_a_failed_fit_shows_its_reason(fit: NonlinearFit) -> None:
 
 def test_the_figure_shows_what_the_fit_says(fit: NonlinearFit) -> None:
     data = squared(400, 2)
-    curve = LearningCurve(method="x", seconds=np.array([0.0, 0.1]), training=np.array([1.0, 0.5]))
-    page = fit_overview(replace(fit, curves=(curve,)), [data])
+    page = fit_overview(fit, [data])
     titles = [a.get_title(loc="left") for a in page.axes]
     assert "e of y, u²" in titles
-    assert {"learning over time", "learning over iterations"} <= set(titles)
-    assert any("coefficients with 95 % intervals" in x for x in texts_of(page))
+    assert "predictions with their bands" in texts_of(page)
     traces = traces_of(fit, data)
     assert fit.model is not None
     np.testing.assert_array_equal(traces.measured, data.y[fit.model.lag :])
@@ -163,38 +159,6 @@ def test_six_of_many_records_are_drawn_and_the_second_one_too(fit: NonlinearFit)
     assert {f"{k}.csv" for k in range(6)} <= set(texts)
     assert "6.csv" not in texts
     assert "second record, not fitted: 8.csv" in texts
-
-
-def test_the_most_significant_coefficients_have_bars_of_their_95_percent_intervals(fit: NonlinearFit) -> None:
-    bars = bars_of(fit)
-    assert bars is not None
-    assert fit.model is not None
-    assert fit.sd is not None
-    ratio = np.abs(fit.model.theta) / fit.sd
-    assert len(bars.names) == 25
-    assert bars.n_more == fit.model.theta.size - 25
-    assert set(bars.names) == {fit.model.names[k] for k in np.argsort(-ratio)[:25]}
-    k = fit.model.names.index(bars.names[0])
-    assert (bars.theta[0], bars.half_width[0]) == (fit.model.theta[k], pytest.approx(1.96 * fit.sd[k], rel=1e-3))
-    assert bars_of(replace(fit, covariance=None)) is None
-
-
-def test_of_weights_without_names_the_predictions_with_their_bands_are_drawn(fit: NonlinearFit) -> None:
-    plain = replace(fit, details={})
-    assert bars_of(plain) is None
-    data = squared(400, 2)
-    page = fit_overview(plain, [data])
-    page.canvas.draw()
-    texts = texts_of(page)
-    assert "predictions with their bands" in texts
-    assert not any("coefficients" in x for x in texts)
-    axes = next(a for a in page.axes if a.get_title(loc="left") == "measured less predicted")
-    low, high = (float(f(axes.collections[0].get_datalim(axes.transData).intervaly)) for f in (np.min, np.max))
-    scale = 1e-3 if "mm" in axes.get_ylabel() else 1.0
-    sd = np.sqrt(fit.noise_covariance[0, 0])
-    assert high * scale > 1.96 * sd * 0.999
-    assert high * scale < 1.96 * sd * 3.0
-    assert low == pytest.approx(-high)
 
 
 def test_a_free_run_that_diverges_is_left_out_of_the_figure() -> None:

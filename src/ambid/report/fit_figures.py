@@ -1,13 +1,11 @@
-"""Figures of fits: records beside the model, Bode diagram and poles of a linear one; of a nonlinear one coefficients,
-predictions with bands, correlations, learning curves.
+"""Figures of fits: records beside the model, Bode diagram and poles of a linear one; of a nonlinear one its predictions
+with bands, and correlations.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +23,6 @@ from ambid.report.document import Part
 from ambid.report.drawing import (
     BAND,
     BOUND,
-    CYCLE,
     MEASURED,
     PREDICTED,
     WIDE,
@@ -49,7 +46,6 @@ from ambid.report.signals import (
     whiteness_panel,
     worst_stretch,
 )
-from ambid.report.text import coefficient_text
 from ambid.validation.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
 from ambid.validation.residuals import P_LEAST, Correlation, correlations
 
@@ -59,26 +55,13 @@ if TYPE_CHECKING:
 
     from ambid.validation.comparison import Comparison
 
-MOST_COEFFICIENTS = 25
 _ACROSS = 5  # correlations beside each other
 _MOST = 20
 _RECORDS = 6  # that are drawn
-_ROWS = 13  # of coefficients below each other
 _LEAST_P = 1e-12  # p-value that is drawn as the smallest
 _POLES = 12  # that a terminal shows
 _WEIGHT = re.compile(r"\bunit \d|\bhidden\b|: bias\b")  # of a network: says nothing by itself
 _LEAD = 500  # samples in which derivatives that are recursions settle
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Bars:
-    """Coefficients as they are drawn, the most significant first."""
-
-    names: tuple[str, ...]
-    theta: Array  # (n_shown,), SI, values, and half of their 95 % intervals
-    half_width: Array
-    n_more: int  # coefficients that are not shown
-    n_others: int  # estimated numbers that are no coefficients: weights of a network
 
 
 def fit_overview(
@@ -87,7 +70,7 @@ def fit_overview(
     """Draw all figures of a fit with a model on one page.
 
     `second`: a further record that a nonlinear fit was judged on; `width`: of the page, inches. Without records what
-    needs none is drawn, of a fit without a model its reason.
+    needs none is drawn, or that they lack; of a fit without a model its reason.
     """
     if fit.model is None:
         return stacked(_title(fit, records, second), [said_panel(getattr(fit, "reason", ""))], width)
@@ -98,7 +81,7 @@ def fit_overview(
         blocks.append(_poles(fit))
     else:
         blocks += _nonlinear_blocks(fit, records, second)
-    return stacked(_title(fit, records, second), blocks, width)
+    return stacked(_title(fit, records, second), blocks or [said_panel("figures need the records")], width)
 
 
 def comparison_figure(comparison: Comparison, held_out: IOData | None = None, width: float = WIDE) -> Figure:
@@ -147,19 +130,14 @@ def comparison_figure(comparison: Comparison, held_out: IOData | None = None, wi
 
 
 def _nonlinear_blocks(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[Block]:
-    """Coefficients or bands, correlations of the errors, learning curves."""
+    """Bands of the predictions, correlations of the errors."""
     blocks: list[Block] = []
-    bars = bars_of(fit)
-    if bars is not None:
-        blocks.append(_draw_bars(bars))
-    if fit.covariance is not None and (bars is None or bars.n_others) and records:
+    if fit.covariance is not None and records:
         where, data = ("the second record", second) if second is not None else (_name(records[0], 0), records[0])
         blocks.append(_draw_band(fit, data, where))
     correlations_shown = _correlations(fit, records) if records else []
     if correlations_shown:
         blocks.append(_draw_correlations(correlations_shown))
-    if any(c.training.size for c in fit.curves):
-        blocks.append(_draw_training(fit))
     return blocks
 
 
@@ -289,98 +267,6 @@ def _draw_correlations(correlations_shown: list[Correlation]) -> Block:
 
     columns = [[panel(one, c) for c in correlations_shown[k::_ACROSS]] for k in range(_ACROSS)]
     return Block(columns=[x for x in columns if x], title="correlations of residuals (Billings and Voon 1986)")
-
-
-def _draw_training(fit: NonlinearFit) -> Block:
-    positive = [float(t) for c in fit.curves for t in c.seconds if t > 0]
-    earliest = min(positive, default=1.0) / 2  # a logarithm has no zero
-    methods = [c.method for c in fit.curves]
-    names = [f"{k + 1}. {m}" if methods.count(m) > 1 else m for k, m in enumerate(methods)]
-    sizes = [float(x) for c in fit.curves for x in (*c.training, *c.held_out) if np.isfinite(x) and x > 0]
-    times = [max(float(t), earliest) for c in fit.curves for t in c.seconds]
-
-    def draw(axes: Axes, by_time: bool) -> None:
-        for c, name, color in zip(fit.curves, names, cycle(CYCLE), strict=False):
-            at = np.maximum(c.seconds, earliest) if by_time else np.arange(c.training.size)
-            axes.plot(at, c.training, ".-", color=color, markersize=3, linewidth=1.0, label=name)
-            if c.held_out.size == c.training.size:
-                axes.plot(at, c.held_out, "--", color=color, linewidth=0.9, label="held out")
-        if by_time and max(times) > 5 * min(times):
-            log_axis(axes.xaxis, min(times), max(times))
-        if sizes and max(sizes) > 5 * min(sizes):
-            log_axis(axes.yaxis, min(sizes), max(sizes))
-        elif sizes and max(sizes) < 1.01 * min(sizes):  # a search that began where it ended is flat
-            axes.set_ylim(0.98 * min(sizes), 1.02 * max(sizes))
-        axes.set_xlabel("time [s]" if by_time else "iteration")
-        axes.set_ylabel("rms error / sd of output")
-        head(axes, f"learning over {'time' if by_time else 'iterations'}")
-
-    return Block(columns=[[panel(draw, x, height=2.6)] for x in (True, False)])
-
-
-def bars_of(fit: NonlinearFit) -> Bars | None:
-    """Return the coefficients that are worth a bar each.
-
-    Returns none where there are no standard deviations, or the numbers say nothing one by one: more than 25 that are
-    not named after terms, or weights of a network. Of a model with terms only these are shown.
-    """
-    sd, model = fit.sd, fit.model
-    if sd is None or model is None:
-        return None
-    worth = estimated = np.flatnonzero(sd > 0)
-    names = term_names(fit)
-    if names:
-        worth = np.array([k for k in worth if model.names[k] in names], dtype=int)
-    elif worth.size > MOST_COEFFICIENTS or any(map(is_weight, model.names)):
-        return None
-    if not worth.size:
-        return None
-    order = worth[np.argsort(-np.abs(model.theta[worth]) / sd[worth], kind="stable")]
-    largest = order[:MOST_COEFFICIENTS]
-    return Bars(
-        names=tuple(model.names[k] for k in largest),
-        theta=model.theta[largest],
-        half_width=NORMAL_95 * sd[largest],
-        n_more=int(order.size - largest.size),
-        n_others=int(estimated.size - order.size),
-    )
-
-
-def term_names(fit: NonlinearFit) -> set[str]:
-    """Return the names of the parameters that belong to chosen terms.
-
-    `fit`: with a model. Returns empty for a structure without terms.
-    """
-    if fit.model is None:
-        return set()
-    several, chosen = len(fit.outputs) > 1, term_ratios(fit)
-    below = {f"{x.split(': ')[0]}: " if several else "" for x in chosen}
-    return {x for x in fit.model.names if x in chosen or any(x.startswith(f"{b}1/(") for b in below)}
-
-
-def _draw_bars(bars: Bars) -> Block:
-    """Draw coefficients with their 95 % intervals, each on a scale of its own: they differ by orders of magnitude."""
-    columns = -(-len(bars.names) // _ROWS)
-    per = -(-len(bars.names) // columns)
-    more = f"; {bars.n_more} more, less significant, are omitted" if bars.n_more else ""
-    panels = [panel(_bars, bars, slice(c * per, (c + 1) * per), per, height=0.6 + 0.21 * per) for c in range(columns)]
-    title = "coefficients with 95 % intervals, each on its own scale; orange: zero lies inside"
-    return Block(columns=[[p] for p in panels], title=f"{title}{more}")
-
-
-def _bars(axes: Axes, bars: Bars, part: slice, rows: int) -> None:
-    names, values, halves = bars.names[part], bars.theta[part], bars.half_width[part]
-    at = rows - 1 - np.arange(len(names))
-    for y, value, half in zip(at, values, halves, strict=True):
-        far = abs(value) + half
-        color = BOUND if abs(value) < half else PREDICTED
-        axes.errorbar(value / far, y, xerr=half / far, fmt="o", color=color, markersize=3.5, capsize=2.5)
-    axes.axvline(0, color=MEASURED, linewidth=0.8)
-    texts = [f"{n} = {coefficient_text(float(v), float(h))}" for n, v, h in zip(names, values, halves, strict=True)]
-    axes.set_yticks(at, texts)
-    axes.set_xticks([0.0], ["0"])
-    axes.set_xlim(-1.1, 1.1)
-    axes.set_ylim(-0.7, rows - 0.3)
 
 
 def _draw_band(fit: NonlinearFit, data: IOData, where: str) -> Block:

@@ -36,8 +36,7 @@ _JOBS = (
         records={"help": "Record: .csv, .csv.gz, .h5, .mat, .tdms, .mf4, .mdf, .parquet, .feather or .arrow; "
         "nonlinear structures take several of one bench."},
         seed={"help": "Seed of all randomness in a nonlinear structure.", "default": None, "shown": "0"},
-        plot={"help": "Draw signals, residuals, Bode and poles; for a nonlinear structure signals, errors, "
-        "coefficients and learning curves."}),
+        plot={"help": "Draw signals, residuals, Bode and poles; for a nonlinear structure signals, errors and bands."}),
     declare("frf", "record input output reference open_loop method band hold orders state_space feedthrough modes "
         "estimate domain delay rig from_s to_s rate_hz gaps layout json plot report strict",
         band={"help": "Frequency band to use, in Hz.", "shown": "all"},
