@@ -80,23 +80,3 @@ def test_a_fit_that_cannot_carry_the_rig_s_model_is_refused(bearing, ambid, monk
     assert refused.code == 2
     assert len(refused.err.splitlines()) == 1
     assert not (bearing / "none.json").exists()
-
-
-def test_sensitivity_and_stabilisation_are_shown_where_asked_for(step, ambid):
-    words = ("--input", "u", "--output", "y", "--structure", "oe", "--orders", "nb=2,nf=2,nk=1", "--at-rest")
-    found = ambid("fit", "step.csv", *words, "--sensitivity", "--json", "fit.json")
-    assert found.code == 0, found.err
-    lines = found.out[found.out.index("sensitivity\n") :].splitlines()
-    assert max(map(len, lines)) <= 80
-    assert sorted(x.split()[0] for x in lines[2:6]) == ["b1", "b2", "f1", "f2"]
-    document = json.loads((step / "fit.json").read_text())["sensitivity"]
-    assert {x["name"] for x in document["influences"]} == {"b1", "b2", "f1", "f2"}
-    assert document["collinearity"] > 1
-    rng = np.random.default_rng(2)
-    u = rng.standard_normal(800)
-    y = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], u) + 0.05 * rng.standard_normal(800)
-    table = np.column_stack([np.arange(800) / 100.0, u, y])
-    np.savetxt(step / "noise.csv", table, delimiter=",", header="time [s],u [V],y [A]", comments="")
-    drawn = ambid("fit", "noise.csv", *words, "--stabilisation", "poles.png")
-    assert drawn.code == 0, drawn.err
-    assert (step / "poles.png").read_bytes().startswith(b"\x89PNG")

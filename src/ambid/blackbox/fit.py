@@ -176,8 +176,7 @@ class BlackBoxFit(FittedModel, Linear):
     details : Mapping[str, object]
         Further results of the method as JSON-able values (singular values, condition numbers, chosen horizons).
     derived : Mapping[str, object]
-        What was worked out from it, ``physical`` parameters of a rig, ``sensitivity`` of the coefficients; written, but
-        not read back.
+        What was worked out from it: ``physical`` parameters of a rig; written, but not read back.
     """
 
     orders: UsedOrders
@@ -250,8 +249,7 @@ def fit_text(fit: BlackBoxFit) -> str:
     """Return the JSON text of a fit, with what was derived from it."""
     document = fit_to_json(fit)
     for name, x in fit.derived.items():
-        entries = fields_json(x, without=("structure", "singular_values", "weakest") if name == "physical" else ())
-        document[name] = covariance_together(entries) if name == "physical" else entries
+        document[name] = covariance_together(fields_json(x, without=("structure", "singular_values", "weakest")))
     return json_text(document)
 
 

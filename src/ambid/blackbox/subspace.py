@@ -63,7 +63,7 @@ class Plan:
 
     method: Method
     n: int | None  # order; None to choose it
-    n_max: int  # largest order that the horizons and the record allow, or that was asked for
+    n_max: int  # largest order that the horizons and the record allow
     past: int  # samples
     future: int
     feedthrough: bool
@@ -75,16 +75,15 @@ class Plan:
 
 
 def plan_estimate(
-    method: Method, data: IOData, orders: Orders, horizon: int | None, feedthrough: bool | None, tick: Tick,
-    n_max: int | None = None,
-) -> Plan:  # fmt: skip
+    method: Method, data: IOData, orders: Orders, horizon: int | None, feedthrough: bool | None, tick: Tick
+) -> Plan:
     """Check orders and options, compress the record, choose what was left open; `horizon`: samples of future and of
-    past; `feedthrough`: whether to estimate D; `n_max`: largest order to try.
+    past; `feedthrough`: whether to estimate D.
     """
     check_order_names(method, orders, ("n",))
     n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or give 'auto'")
     scaled = channels(data)
-    largest = n or n_max or _AUTO_MAX
+    largest = n or _AUTO_MAX
     longest = _longest(method, data, scaled.n_samples, largest, horizon)
     length = longest + 1 if method == "pbsid" else 2 * longest
     factors = compress(scaled, length, _GROUPS)
@@ -94,7 +93,7 @@ def plan_estimate(
     check_inputs_differ(factors, total, data.inputs, 1)
     criterion = autoregression_criterion(factors, total)
     wanted = wanted_lags = int(np.argmin(criterion))
-    least = _shortest(data, largest, bool(n or n_max))
+    least = _shortest(data, largest, bool(n))
     if method == "pbsid":  # the prior makes a long past cheap, and a short one is what leaves bias
         least, wanted = max(least, 20), wanted + wanted // 2
     chosen = horizon or min(max(wanted, least), longest)
@@ -392,52 +391,6 @@ def _result(method: Method, data: IOData, first: FirstModel, covariance: Array |
             "R": (full.R * np.outer(y, y)).tolist(),
         },
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OrderModel:
-    """The model of one order among several from one factorisation."""
-
-    order: int  # number of states
-    model: StateSpaceModel  # in SI
-    innovation: Array  # (n_outputs, n_outputs), SI, covariance of the innovations
-    criterion: float  # bayes' criterion by which orders are compared
-    singular_value: float  # the `order`-th one
-
-
-def subspace_models(
-    data: IOData,
-    method: Method,
-    n_max: int,
-    *,
-    tick: Tick = None,
-) -> tuple[OrderModel, ...]:
-    """Identify models of orders 1 ... `n_max` (fewer where horizons or data show fewer states) from one factorisation,
-    without covariance, for a stabilisation diagram.
-    """
-    if n_max < 1:
-        raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
-    with one_thread():
-        plan = plan_estimate(method, data, {}, None, None, tick, n_max)
-        _, states = decomposition(plan)
-        criterion = order_criterion(plan)
-        out = []
-        for n in range(1, min(plan.n_max, states.values.size, criterion.size - 1) + 1):
-            scaled = model_of(plan, states, n)
-            model, _ = to_units(scaled, plan.channels, data.dt)
-            scale = plan.channels.scale_y
-            out.append(
-                OrderModel(
-                    order=n,
-                    model=model,
-                    innovation=scaled.innovation * np.outer(scale, scale),
-                    criterion=float(criterion[n]),
-                    singular_value=float(states.values[n - 1]),
-                )
-            )
-            if tick is not None:
-                tick()
-    return tuple(out)
 
 
 n4sid = partial(estimate, "n4sid")  # Van Overschee and De Moor 1996, fig. 4.8

@@ -16,10 +16,7 @@ def command(v: Values) -> None:
     """
     from ambid.job import accept
 
-    with (
-        Outputs(*v.records, v.rig, v.estimate, **v.outputs) as outputs,
-        progress("accept") as show,
-    ):
+    with Outputs(*v.records, v.rig, v.estimate, **v.outputs) as outputs, progress("accept") as show:
         how = v.only("estimate speed_rpm from_s to_s rate_hz gaps layout")
         result = accept(v.records, v.rig, **how, tick=show)
         outputs.give(result, show)

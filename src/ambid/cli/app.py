@@ -52,7 +52,10 @@ _BESIDE = {"compare": "fit", "margins": "frf", "models": "info", "validate": "id
 _PART = "'ambid validate RESULT RECORD' with --from and --to"
 # Words of the releases before, by job: what each is now; nothing where it is gone.
 _FORMER: Mapping[str, Mapping[str, str]] = {
-    "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
+    "fit": {
+        "settings": "--orders", "validate-from": _PART, "validate-to": _PART, "sensitivity": "",
+        "stabilisation": "'ambid frf RECORD --modes auto --plot FILE.png'",
+    },
     "identify": {
         "magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig",
         "export": "'ambid export ESTIMATE.json -o FILE', of what --json ESTIMATE.json wrote",

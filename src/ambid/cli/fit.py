@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -14,8 +13,6 @@ from ambid.cli.options import Values, refuse_twice, verb
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import EstimationError
-from ambid.job.files import FIGURE_ENDINGS
-from ambid.settings.caller import refuse_given
 
 
 @verb("fit")
@@ -31,14 +28,8 @@ def command(v: Values) -> None:
     from ambid.rig import load_rig
 
     nonlinear = v.structure in NONLINEAR_STRUCTURES
-    if nonlinear:
-        refuse_given(
-            v.only("stabilisation sensitivity"),
-            f"{{}} is for linear structures; {v.structure} does not use it. Omit it",
-        )
     stop = Stop()
     with Outputs(*v.records, v.validate, v.rig, **v.outputs) as outputs:
-        outputs.claim(v.stabilisation, "stabilisation", FIGURE_ENDINGS)
         refuse_twice(v.records)
         if nonlinear and v.validate is not None and v.validate.resolve() in {x.resolve() for x in v.records}:
             raise EstimationError(
@@ -55,25 +46,11 @@ def command(v: Values) -> None:
             stop.torn()
             if bench is not None and not nonlinear:
                 found = replace(found, derived={"physical": physics(found, bench)})
-            data = found.used[0]
-            if v.sensitivity:
-                from ambid.validation.sensitivity import sensitivity_analysis
-
-                found = replace(found, derived={**found.derived, "sensitivity": sensitivity_analysis(found, data[0])})
-            outputs.draw(v.stabilisation, lambda: _poles_by_order(found, data[0], show), show)
             outputs.give(found, show)
     outputs.show(found)
     if stop.wished():
         raise typer.Exit(stop.code)
     end(failed=found.status == "failed" or (v.strict and not found.passed))
-
-
-def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
-    from ambid.report.response import stabilisation_figure
-    from ambid.validation.orders import stabilisation
-
-    method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
-    return stabilisation_figure(stabilisation(data, method, tick=lambda: tick("stabilisation")))
 
 
 @verb("compare")
@@ -85,10 +62,7 @@ def compare(v: Values) -> None:
     """
     from ambid.job import compare
 
-    with (
-        Outputs(v.record, v.validate, v.rig, **v.outputs) as outputs,
-        progress("compare") as tick,
-    ):
+    with Outputs(v.record, v.validate, v.rig, **v.outputs) as outputs, progress("compare") as tick:
         how = v.only("input output reference rig open_loop from_s to_s rate_hz gaps layout validate holdout")
         found = compare(v.record, v.candidates, **how, tick=tick)
         outputs.give(found, tick)

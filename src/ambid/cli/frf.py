@@ -42,10 +42,7 @@ def margins(v: Values) -> None:
     """
     from ambid.job import margins
 
-    with (
-        Outputs(v.record, v.rig, v.estimate, **v.outputs) as outputs,
-        progress("margins") as show,
-    ):
+    with Outputs(v.record, v.rig, v.estimate, **v.outputs) as outputs, progress("margins") as show:
         how = v.only("estimate reference from_s to_s rate_hz gaps layout")
         found = margins(v.record, v.rig, **how, tick=show)
         outputs.give(found, show)

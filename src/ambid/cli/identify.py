@@ -69,10 +69,7 @@ def validate(v: Values) -> None:
     """
     from ambid.job.results import validate
 
-    with (
-        Outputs(v.estimate, v.record, v.rig, **v.outputs) as outputs,
-        progress("validate") as show,
-    ):
+    with Outputs(v.estimate, v.record, v.rig, **v.outputs) as outputs, progress("validate") as show:
         found = validate(v.estimate, v.record, v.rig, **v.only("from_s to_s rate_hz gaps layout"))
         outputs.give(found, show)
     outputs.show(found, strict=v.strict)

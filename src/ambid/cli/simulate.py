@@ -50,10 +50,7 @@ def command(v: Values) -> None:
         comments: tuple[str, ...] = ()
         if v.out.suffix not in (".h5", ".hdf5"):
             between = "" if v.band is None else f" in {v.band[0]:g}:{v.band[1]:g} Hz"
-            comments = (
-                _recipe(v.rig, f"{told.words(6)}{between}", v.seed),
-                f"truth: {truth_words(done)}",
-            )
+            comments = (_recipe(v.rig, f"{told.words(6)}{between}", v.seed), f"truth: {truth_words(done)}")
         outputs.stage(v.out, lambda path: write_record(made, path))
         outputs.stage_notes(v.out, comments)
     warn(done)

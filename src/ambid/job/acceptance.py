@@ -13,15 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.control.acceptance import (
-    PARTS,
-    Acceptance,
-    Item,
-    Run,
-    Stiffness,
-    dynamic_stiffness,
-    whirl_lines,
-)
+from ambid.control.acceptance import PARTS, Acceptance, Item, Run, Stiffness, dynamic_stiffness, whirl_lines
 from ambid.control.closed import ClosedLoop
 from ambid.control.margins import Margins
 from ambid.errors import AmbidError, EstimationError, counted

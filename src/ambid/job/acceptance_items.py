@@ -10,15 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from ambid.arrays import Array, Complex
-from ambid.control.acceptance import (
-    Item,
-    Outcome,
-    Part,
-    dynamic_stiffness,
-    outcome_of,
-    outcome_of_zone,
-    stiffness_sd,
-)
+from ambid.control.acceptance import Item, Outcome, Part, dynamic_stiffness, outcome_of, outcome_of_zone, stiffness_sd
 from ambid.control.closed import ClosedLoop
 from ambid.control.limits import CLEARANCE_SHARE, residual_unbalance, vibration_limit
 from ambid.control.margins import Margins, synchronous
@@ -36,15 +28,7 @@ from ambid.rig.rotor import Operation
 from ambid.rotor.balance import Machine as Rotor
 from ambid.rotor.balance import Turned
 from ambid.rotor.estimate import RotorEstimate
-from ambid.rotor.passage import (
-    Passage,
-    changes_speed,
-    displacements,
-    positions_of,
-    track_passage,
-    turning_of,
-    whirl_of,
-)
+from ambid.rotor.passage import Passage, changes_speed, displacements, positions_of, track_passage, turning_of, whirl_of
 from ambid.rotor.resonance import (
     CRITICALLY_DAMPED,
     SCALING,

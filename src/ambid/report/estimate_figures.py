@@ -22,19 +22,7 @@ from ambid.estimation.likelihood import prediction_error
 from ambid.estimation.linear import one_thread
 from ambid.estimation.result import NORMAL_95
 from ambid.physics.linear_model import discretise, model
-from ambid.report.drawing import (
-    BOUND,
-    CYCLE,
-    MEASURED,
-    WIDE,
-    Block,
-    Panel,
-    head,
-    log_axis,
-    panel,
-    single,
-    stacked,
-)
+from ambid.report.drawing import BOUND, CYCLE, MEASURED, WIDE, Block, Panel, head, log_axis, panel, single, stacked
 from ambid.report.numbers import prefixed, sized
 from ambid.report.parameters import pole_table
 from ambid.report.response_panels import Pole, bode_panel, correlations_panel, frequency_grid, poles_panel, roots

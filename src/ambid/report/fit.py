@@ -18,9 +18,8 @@ from ambid.report.estimate import physics_section, second_parts, signals_and_fig
 from ambid.report.fit_figures import comparison_figure, fit_overview, is_weight, pole_parts, term_ratios, traces_of
 from ambid.report.numbers import sized
 from ambid.report.parameters import fit_table, parameter_table, short_numbers
-from ambid.report.text import Cell, Line, coefficient_text, fraction, names_words, pure, title_line
+from ambid.report.text import Cell, Line, coefficient_text, fraction, names_words, title_line
 from ambid.settings.caller import setting
-from ambid.validation.sensitivity import SensitivityAnalysis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,13 +91,8 @@ def fit_sections(fit: AnyFit) -> list[Section]:
         Section(parts=[Lines(lines=[f"criteria: {text}; {fit.n_estimated} parameters estimated"] if text else [])]),
         Section(parts=[Lines(lines=trainings, indent=2)]),
         *ending(fit),
-        *(derived_section(x) for x in getattr(fit, "derived", {}).values()),
+        *(physics_section(x) for x in getattr(fit, "derived", {}).values()),
     ]
-
-
-def derived_section(derived: Any) -> Section:
-    """Return what was derived from a fit: the sensitivity of its coefficients, or physical parameters."""
-    return sensitivity_section(derived) if isinstance(derived, SensitivityAnalysis) else physics_section(derived)
 
 
 def _header(fit: AnyFit) -> list[Part]:
@@ -296,9 +290,6 @@ def curve_line(curve: LearningCurve) -> str:
     return text + (f", held out {values[0]:.3g} -> {np.min(values):.3g}" if values.size else "")
 
 
-_INFLUENCES = 24  # coefficients of a sensitivity analysis
-
-
 def comparison_document(comparison: Comparison, source: Any) -> Document:
     """Describe a comparison; `source`: the data that it was judged on."""
 
@@ -369,34 +360,3 @@ def _entry(entry: Entry, least: float) -> tuple[str, ...]:
 
 def _order(value: object) -> str:
     return "/".join(str(v) for v in value) if isinstance(value, tuple) else str(value)
-
-
-def sensitivity_section(sensitivity: SensitivityAnalysis) -> Section:
-    """Return the numbers that matter most first, then which belong together."""
-    s = sensitivity
-    rows: list[Sequence[str]] = [("", "value ± sd", "fit alone", "fit free", "poles", "response")]
-    rows += [
-        (
-            x.name,
-            pure(x.value, x.sd),
-            *(f"{c:.3g}" for c in (x.fit_alone, x.fit_free)),
-            *map(_share, (x.poles, x.response)),
-        )
-        for x in s.influences[:_INFLUENCES]
-    ]
-    rest = len(s.influences) - _INFLUENCES
-    index = "infinite" if not np.isfinite(s.collinearity) else f"{s.collinearity:.3g}"
-    pairs = "; ".join(f"{a} with {b} ({r:+.3f})" for a, b, r in s.pairs[:6]) or "none above 0.9"
-    weakest = ", ".join(f"{name} {100 * part:+.3g} %" for name, part in s.weakest)
-    notes = [
-        *([f"… and {rest} more of less effect; {setting('json')} has them all"] if rest > 0 else []),
-        "for a change of one coefficient by 1 %: rise of -2 log L with the others kept, and with the others "
-        "refitted (below 4: within 2 sd); largest move of a pole; change of the frequency response",
-        f"collinearity of all coefficients {index} (below 10 is good); correlated: {pairs}",
-        *([f"least identifiable, relative to each other: {weakest}"] if weakest else []),
-    ]
-    return Section(heading=[("sensitivity", "strong")], parts=[grid(rows), Lines(lines=notes)])
-
-
-def _share(x: float | None) -> str:
-    return "–" if x is None or not np.isfinite(x) else f"{100 * x:.3g} %"

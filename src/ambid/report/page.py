@@ -13,16 +13,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from ambid.estimation.result import Verdict
-from ambid.report.document import (
-    Document,
-    Part,
-    Preformatted,
-    Section,
-    grid,
-    page_sections,
-    pieces,
-    warnings_of,
-)
+from ambid.report.document import Document, Part, Preformatted, Section, grid, page_sections, pieces, warnings_of
 from ambid.report.drawing import STYLES, WIDE
 from ambid.report.picture import picture
 from ambid.report.text import SPREAD, WORDS, Cell, columns

@@ -121,10 +121,7 @@ PARAMETERS: Sequence[Column] = (
         cell=lambda row: row.interval,
         wide=lambda row: row.in_unit(row.interval),
         right=True,
-        frame={
-            "ci95_low": lambda row: row.parameter.ci95[0],
-            "ci95_high": lambda row: row.parameter.ci95[1],
-        },
+        frame={"ci95_low": lambda row: row.parameter.ci95[0], "ci95_high": lambda row: row.parameter.ci95[1]},
     ),
     Column(
         label="with calibration",

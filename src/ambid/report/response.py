@@ -52,7 +52,6 @@ from ambid.report.response_panels import Complex, Pair, angle_ticks, magnitude_a
 from ambid.report.text import Cell, Line, plain, status_words, title_line, wrapped
 from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
-from ambid.validation.orders import Stabilisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -358,8 +357,6 @@ _KINDS = (
 
 _NEAR_MODE = 0.02  # of its frequency, within which a mode's peak lies
 
-_WIDE = 100.0  # largest over smallest frequency from which the axis is logarithmic
-
 
 # --- a measured frequency response ----------------------------------------------------------------------------------
 
@@ -447,52 +444,15 @@ def _marker(n: int) -> float:
     return 4.0 if n <= 300 else 2.0 if n <= 3000 else 1.0
 
 
-# --- a stabilisation diagram ----------------------------------------------------------------------------------------
-
-
-def stabilisation_figure(stabilisation: Stabilisation, width: float = WIDE) -> Figure:
-    """Draw poles by order over frequency, above them damping over frequency, beside them the singular values."""
-    frequencies = np.array([p.frequency_hz for p in stabilisation.poles if p.frequency_hz > 0])
-    logarithmic = bool(frequencies.size and frequencies.max() > _WIDE * frequencies.min())
-
-    damping, diagram = pole_panels(stabilisation.poles, stabilisation.modes, logarithmic=logarithmic)
-
-    def values(axes: Axes) -> None:
-        size = np.asarray(stabilisation.singular_values)
-        axes.semilogx(
-            size / max(float(size.max(initial=0.0)), 1e-300), stabilisation.orders, "o-", color=_NEW, markersize=4
-        )
-        axes.axhline(stabilisation.suggested, color=_MODE, linewidth=1.0, linestyle="--")
-        axes.set_xlabel("singular value")
-        _orders(axes)
-        head(axes, f"least BIC: order {stabilisation.suggested}")
-
-    empty = Panel(draw=lambda axes: axes.axis("off"), height=0.2)
-    block = Block(
-        columns=[[damping, diagram], [empty, Panel(draw=values)]],
-        widths=(4, 1),
-    )
-    return stacked(f"stabilisation diagram, {stabilisation.method}", [block], width)
-
-
-def pole_panels(
-    poles: Sequence[TrialPole],
-    modes: Sequence[PoleCluster],
-    *,
-    logarithmic: bool = False,
-    most: float | None = None,
-) -> tuple[Panel, Panel]:
-    """Return damping over frequency of stable poles, with the modes' names, and below it all poles by order.
-
-    `most`: damping up to which it is drawn.
+def pole_panels(poles: Sequence[TrialPole], modes: Sequence[PoleCluster], most: float) -> tuple[Panel, Panel]:
+    """Return damping over frequency of stable poles up to a largest one, with the modes' names, and below it all poles
+    by order.
     """
 
     def over_frequency(axes: Axes) -> None:
         for mode in modes:
             axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6, label="mode")
         axes.set_xlabel("frequency of the pole [Hz]")
-        if logarithmic:
-            axes.set_xscale("log")
 
     def damping(axes: Axes) -> None:
         over_frequency(axes)
@@ -504,8 +464,7 @@ def pole_panels(
             axes.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
         axes.axhline(0, color=_NEW, linewidth=0.8)
         axes.set_ylabel("damping")
-        if most is not None:
-            axes.set_ylim(-0.1 * most, most)
+        axes.set_ylim(-0.1 * most, most)
         head(axes, "damping (under 0: unstable)")
 
     def diagram(axes: Axes) -> None:
@@ -536,7 +495,7 @@ def modal_panel(modal: Modal, title: str = "") -> Block:
         PoleCluster(pole=2 * np.pi * m.frequency_hz.value * complex(-m.damping.value, 1.0), orders=())
         for m in modal.modes
     ]
-    damping, diagram = pole_panels(modal.poles, curves, most=2 * max((c.damping for c in curves), default=0.5))
+    damping, diagram = pole_panels(modal.poles, curves, 2 * max((c.damping for c in curves), default=0.5))
     columns = [[damping, diagram]]
     if modal.modes and len(modal.outputs) > 1:
         empty = Panel(draw=lambda axes: axes.axis("off"), height=2.0)

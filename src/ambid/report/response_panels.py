@@ -14,17 +14,7 @@ from ambid.arrays import Array
 from ambid.bearing.measured import ModelResponse
 from ambid.estimation.result import NORMAL_95
 from ambid.report.document import Part, part_lines
-from ambid.report.drawing import (
-    BAND,
-    BOUND,
-    MEASURED,
-    PREDICTED,
-    Block,
-    Panel,
-    head,
-    log_axis,
-    panel,
-)
+from ambid.report.drawing import BAND, BOUND, MEASURED, PREDICTED, Block, Panel, head, log_axis, panel
 from ambid.report.numbers import response_unit
 from ambid.signals.response import FrequencyResponse
 
@@ -235,12 +225,7 @@ def pole_region(axes: Axes, pole: Pole, color: str) -> None:
 
 
 def poles_panel(
-    poles: Sequence[Pole],
-    table: Sequence[Part],
-    title: str,
-    *,
-    zeros: Sequence[Pole] = (),
-    discrete: bool = False,
+    poles: Sequence[Pole], table: Sequence[Part], title: str, *, zeros: Sequence[Pole] = (), discrete: bool = False
 ) -> Block:
     """Draw poles and zeros with their 95 % regions and the border of stability, close views, and a table of numbers.
 

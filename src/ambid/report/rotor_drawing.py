@@ -211,11 +211,7 @@ def _shape(
 
 
 def _campbell(
-    axes: Axes,
-    identified: Campbell | None,
-    drawn: Campbell | None,
-    sd: Array | None,
-    speeds: Sequence[float],
+    axes: Axes, identified: Campbell | None, drawn: Campbell | None, sd: Array | None, speeds: Sequence[float]
 ) -> None:
     """Frequencies in Hz over speed in 1/min."""
     diagrams = [x for x in (identified, drawn) if x is not None]

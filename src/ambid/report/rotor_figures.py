@@ -15,17 +15,7 @@ from ambid.physics.rotor_model import RotorModel, position_role
 from ambid.physics.shaft import Shaft
 from ambid.physics.whirl import campbell, free_rotor_of, whirl_sd
 from ambid.record import Record
-from ambid.report.drawing import (
-    MEASURED,
-    PREDICTED,
-    WIDE,
-    Block,
-    Panel,
-    head,
-    log_axis,
-    panel,
-    stacked,
-)
+from ambid.report.drawing import MEASURED, PREDICTED, WIDE, Block, Panel, head, log_axis, panel, stacked
 from ambid.report.numbers import prefixed, response_unit
 from ambid.report.parameters import pole_table
 from ambid.report.response_panels import (

@@ -32,7 +32,7 @@ _JOBS = (
         plot={"help": "Draw signals, residuals, Bode and poles; with @identify_nonlinear curves with bands, and "
         "every record."}),
     declare("fit", "records structure input output orders seed criterion fix rig reference open_loop at_rest from_s "
-        "to_s rate_hz gaps layout validate json plot report stabilisation sensitivity strict",
+        "to_s rate_hz gaps layout validate json plot report strict",
         records={"help": "Record: .csv, .csv.gz, .h5, .mat, .tdms, .mf4, .mdf, .parquet, .feather or .arrow; "
         "nonlinear structures take several of one bench."},
         seed={"help": "Seed of all randomness in a nonlinear structure.", "default": None, "shown": "0"},

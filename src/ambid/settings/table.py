@@ -151,7 +151,6 @@ SETTINGS = (
         "scheduler that somebody has started, with its workers."),
     Setting("seconds", "positive", "S", "Length of the record in s.", default=10.0),
     Setting("seed", "whole", "N", "Seed of excitation and simulated noise.", least=0, default=0),
-    Setting("sensitivity", "switch", "", "Show how much each coefficient matters, and which are correlated."),
     Setting("set", "text", "NAME=VALUE", "Setting of the job, under its name in Python, such as from_s=0.5; "
         "repeatable.", many=True),
     Setting("settle", "from_zero", "S", "Time after the start that is not recorded, in s.", shown="1 when levitating"),
@@ -163,8 +162,6 @@ SETTINGS = (
     Setting("speeds_rpm", "band", "LO:HI", "Of a rotor in rpm.", shown="from rest to the speed of rig or estimate"),
     Setting("spread", "share", "SHARE", "Two relative standard deviations of a rig's free parameters, for the drawn "
         "plants.", default=0.1),
-    Setting("stabilisation", "path", "FILE.png", "Draw the poles of models of order 1 to 20 (by n4sid, moesp or cva "
-        "if @structure names it, else pbsid)."),
     Setting("start", "text", "ESTIMATE.json|S", "Start from this estimate, or from one of so many seconds of the "
         "record's beginning."),
     Setting("state_space", "text", "n=3|auto", "Fit a state space by subspace identification with the Laguerre "

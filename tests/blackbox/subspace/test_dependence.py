@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from ambid.blackbox.data import IOData
 from ambid.blackbox.model import pole_covariance
 from ambid.blackbox.state_space_search import sspem
-from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
+from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid
 from ambid.errors import EstimationError
 
 METHODS = {"n4sid": n4sid, "moesp": moesp, "cva": cva, "pbsid": pbsid, "sspem": sspem}
@@ -42,8 +42,6 @@ def test_those_that_take_part_are_named():
     u, w, y = signals(1)
     with pytest.raises(EstimationError, match="inputs 'u', 'w' and 's' move together"):
         pbsid(given(y, u=u, w=w, s=u - 3 * w), {"n": 1})
-    with pytest.raises(EstimationError, match="inputs 'u' and 's' move together"):
-        subspace_models(given(y, u=u, w=w, s=2 * u), "cva", 2)
 
 
 def test_an_input_that_is_an_older_sample_of_another_is_refused_from_two_states_on(method):
@@ -85,7 +83,6 @@ def test_more_states_than_a_record_without_noise_shows_are_refused(name):
     u, _, _ = signals(4)
     with pytest.raises(EstimationError, match="identifies 1 state, not 2"):
         METHODS[name](given(np.r_[0.0, u[:-1]], u=u), {"n": 2})
-    assert len(subspace_models(given(np.r_[0.0, u[:-1]], u=u), "pbsid", 3)) == 1
 
 
 def test_prediction_error_without_noise_gives_the_plant_and_says_so():

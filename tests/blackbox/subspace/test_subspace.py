@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import structure
 from ambid.blackbox.model import pole_covariance, response_covariance
-from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
+from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid
 from ambid.errors import EstimationError
 from ambid.physics.linear_model import discretise
 from tests.bearing.benches import run
@@ -172,18 +172,6 @@ def test_residual_covariances_and_gain_fit_together(method):
     K = (A @ P @ C.T + S) @ np.linalg.inv(C @ P @ C.T + R)
     np.testing.assert_allclose(fit.model.K, K, rtol=0.05, atol=0.02)
     assert np.max(np.abs(np.linalg.eigvals(A - fit.model.K @ C))) < 1
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_all_orders_from_one_factorisation(name):
-    data = record(COLOURED, 3000, 10)
-    family = subspace_models(data, name, 6)
-    assert [m.order for m in family] == [1, 2, 3, 4, 5, 6]
-    assert min(family, key=lambda m: m.criterion).order == 3
-    assert distance(family[2].model.poles(), COLOURED.poles()) < 0.15
-    assert all(np.all(np.isfinite(m.model.theta)) for m in family)
-    values = [m.singular_value for m in family]
-    assert values == sorted(values, reverse=True)
 
 
 @pytest.mark.parametrize(
