@@ -78,3 +78,5 @@ def test_four_records_of_forty_tell_a_range_that_holds_what_is_left(monkeypatch)
 
 def test_records_of_one_size_stay_in_their_order():
     assert in_order([3.0] * 7) == list(range(7))
+    assert in_order([]) == []
+    assert sorted(in_order([0.0, 5.0, 0.0])) == [0, 1, 2]

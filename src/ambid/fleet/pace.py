@@ -26,7 +26,7 @@ def in_order(sizes: Sequence[float]) -> list[int]:
     places: dict[float, list[int]] = {}
     for k in reversed(range(len(sizes))):
         places.setdefault(sizes[k], []).append(k)
-    ranked, mean, last = sorted(sizes), max(sum(sizes) / len(sizes), 1e-300), len(sizes) - 1
+    ranked, mean, last = sorted(sizes), max(sum(sizes) / max(len(sizes), 1), 1e-300), len(sizes) - 1
     ends = list(accumulate(1.0 - _BY_SIZE + _BY_SIZE * size / mean for size in ranked))
     steps = (bisect(ends, (0.25 + k * _GOLDEN) % 1.0 * ends[-1]) for k in range(_STEPS * len(sizes)))
     return [places[ranked[k]].pop() for k in dict.fromkeys([*(min(k, last) for k in steps), *range(len(sizes))])]
