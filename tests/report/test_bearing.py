@@ -75,7 +75,7 @@ def test_extrapolation_is_marked(estimate):
 
 
 def test_every_record_is_drawn(evidence, estimate, drawn):
-    assert set(drawn) == {"force", "curves", "map", "records", "correlations"}
+    assert set(drawn) == {"force", "curves", "map", "records"}
     titles = [a.get_title(loc="left") for a in drawn["records"].axes]
     assert [t for t in titles if t and "%" not in t] == list(estimate.noise)
     first, held = evidence.records[0], evidence.records[2]
@@ -111,7 +111,7 @@ def test_the_page_holds_all_and_escapes_names(evidence, estimate):
     page = page_html(estimate_document(e, lambda: replace(evidence, estimate=e)), e.verdict, made="2001-02-03")
     assert "&lt;b&gt;one.csv" in page
     assert bad not in page
-    assert page.count("<svg ") + page.count("<img ") == 5  # a cloud of samples is smaller as pixels
+    assert page.count("<svg ") + page.count("<img ") == 4  # a cloud of samples is smaller as pixels
     assert "Curves over position and current" in page
     assert "2001-02-03" in page
     assert "hyperbolic law" in page  # what each number means

@@ -119,12 +119,12 @@ def test_the_report_holds_everything_and_needs_nothing_else(page, judged):
     assert page.count("http") == page.count('http-equiv="Content-Security-Policy"') + page.count(
         "/*! https://github.com"
     )
-    assert page.count("<svg ") == 6
+    assert page.count("<svg ") == 5
     for p in judged.estimate.parameters:
         assert f"<th>{p.name}</th>" in page
     for name in judged.estimate.checks:
         assert name in page
-    for words in ("ambid 1.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):
+    for words in ("ambid 1.", "numpy ", "made", "2001-01-01", "Correlations", "unstable, time constant", "k_x &lt; 0"):
         assert words in page
 
 

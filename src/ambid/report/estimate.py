@@ -32,7 +32,7 @@ from ambid.report.document import (
     timing_section,
 )
 from ambid.report.numbers import prefixed, sized
-from ambid.report.parameters import calibration_lines, fit_table, parameter_table, short_numbers
+from ambid.report.parameters import calibration_lines, fit_table, parameter_table, pole_table, short_numbers
 from ambid.report.text import (
     Cell,
     Line,
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from ambid.bearing.frequency import FrequencyEstimate
     from ambid.bearing.physical import PhysicalFit
     from ambid.report.estimate_figures import BearingEvidence, Evidence
+    from ambid.report.response_panels import Pole
     from ambid.report.signals import Traces
     from ambid.rotor.replay import RotorReplay
     from ambid.validation.second_record import Validation
@@ -61,6 +62,7 @@ _POSITIONS, _CURRENTS = 5, 3  # of the table of curves
 _UNITS = {"position": "m", "current": "A"}
 _SIGNS = "Sign convention: force = k_i · current − k_x · position; an attracting magnet has k_x < 0."
 _SOURCES = {"information": "information matrix", "robust": "scatter over the record (robust)"}
+_TOGETHER = "Parameters with a correlation near ±1 are known only together: the data show their combination."
 _OUTSIDE = "* outside the recorded range: the law extrapolates; its sd does not cover that"
 _CAPTIONS = {
     "signals": (
@@ -84,11 +86,6 @@ _CAPTIONS = {
         "model, hold and delay of the input taken out.",
     ),
     "poles": ("Poles", "Of the identified plant in open loop, with their 95 % regions."),
-    "correlations": (
-        "Uncertainty of the parameters",
-        "Parameters with a correlation near ±1 are known only together: what the data show is their combination. "
-        "A large condition number says the same of more than two.",
-    ),
     "force": (
         "Force",
         "Force of the magnet over position and current, and how well it is known. Points: samples of the free rotor.",
@@ -151,11 +148,16 @@ def estimate_document(estimate: AnyEstimate, evidence: Callable[[], Evidence | B
 
         return overview(evidence(), width)
 
+    def appendix() -> list[Section]:
+        from ambid.report.estimate_figures import poles
+
+        return [*([poles_section(poles(e))] if isinstance(e, Estimate) else []), *rig_sections(e.rig)]
+
     about = _about_record(e) if isinstance(e, Estimate) else _about_records(e)
     point = ", ".join(f"{role} {x:.6g}" for role, x in e.operating_point.items()) + " (SI)"
     return Document(
         **about["texts"], sections=sections, figure=drawn, frame=table.frame,
-        drawings=drawings, appendix=partial(rig_sections, e.rig),
+        drawings=drawings, appendix=appendix,
         provenance=[
             *about["provenance"], ("rig", str(e.rig.get("name") or "–")), ("operating point", point),
             *computing_time(e.timing_s),
@@ -325,7 +327,13 @@ def correlations_section(title: str, names: tuple[str, ...], covariance: Array) 
     sd = np.sqrt(np.diag(covariance))
     rows = covariance / np.outer(sd, sd)
     cells = [["", *names], *([name, *(f"{x:.3f}" for x in row)] for name, row in zip(names, rows, strict=True))]
-    return Section(title=title, parts=[grid(cells)], folded=True, terminal=False)
+    return Section(title=title, caption=_TOGETHER, parts=[grid(cells)], folded=True, terminal=False)
+
+
+def poles_section(poles: Sequence[Pole]) -> Section:
+    """Return the poles of a plant in numbers, those above the real axis."""
+    above = [(p.value, p.covariance) for p in poles if p.value.imag >= 0]
+    return Section(title="Poles in numbers", parts=pole_table(above, times=True), folded=True)
 
 
 # --- a second record ------------------------------------------------------------------------------------------------

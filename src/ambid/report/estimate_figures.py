@@ -24,8 +24,7 @@ from ambid.estimation.result import NORMAL_95
 from ambid.physics.linear_model import discretise, model
 from ambid.report.drawing import BOUND, CYCLE, MEASURED, WIDE, Block, Panel, head, log_axis, panel, single, stacked
 from ambid.report.numbers import prefixed, sized
-from ambid.report.parameters import pole_table
-from ambid.report.response_panels import Pole, bode_panel, correlations_panel, frequency_grid, poles_panel, roots
+from ambid.report.response_panels import Pole, bode_panel, frequency_grid, poles_panel, roots
 from ambid.report.signals import Traces, records_panel, residuals_panel, signals_panel, whiteness_panel
 from ambid.report.text import names_words
 from ambid.signals.frf import frf_local
@@ -111,8 +110,6 @@ class Evidence:
                 "whiteness": whiteness_panel(traces, failed),
             }
         blocks |= {"bode": _bode(e, measured_beside(self)), "poles": _poles(e)}
-        if len(e.covariance_names) > 1:
-            blocks["correlations"] = correlations_panel(e.covariance_names, e.covariance, e.values)
         return blocks
 
 
@@ -136,7 +133,6 @@ class BearingEvidence:
             "curves": _curves(e),
             "map": _map(self),
             **({"records": records_panel(self.records)} if self.records else {}),
-            "correlations": correlations_panel(e.covariance_names, e.covariance, e.values),
         }
 
 
@@ -321,9 +317,7 @@ def _bode(estimate: Estimate, measured: FrequencyResponse | None) -> Block:
 
 
 def _poles(estimate: Estimate) -> Block:
-    spectrum = poles(estimate)
-    table = pole_table([(p.value, p.covariance) for p in spectrum if p.value.imag >= 0], times=True)
-    return poles_panel(spectrum, table, "poles of the identified plant")
+    return poles_panel(poles(estimate), "poles of the identified plant")
 
 
 # --- a nonlinear bearing --------------------------------------------------------------------------------------------

@@ -237,7 +237,6 @@ def _poles(fit: BlackBoxFit) -> Block:
     delayed = ", without the delay" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
     return poles_panel(
         roots(poles, of_poles, 1e3),
-        pole_parts(fit),
         f"poles and zeros{hidden}{delayed}",
         zeros=roots(zeros[near], of_zeros, reach),
         discrete=fit.model.dt is not None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,8 +12,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.measured import ModelResponse
 from ambid.estimation.result import NORMAL_95
-from ambid.report.document import Part, part_lines
-from ambid.report.drawing import BAND, BOUND, MEASURED, PREDICTED, Block, Panel, head, log_axis, panel
+from ambid.report.drawing import BAND, BOUND, MEASURED, PREDICTED, Block, Panel, head, panel
 from ambid.report.numbers import response_unit
 from ambid.signals.response import FrequencyResponse
 
@@ -27,7 +25,6 @@ Pair = tuple[int, int]  # output, input
 MOST_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
 _CHI2_95 = 5.991464547107979  # of two degrees of freedom
 _NEAR = 0.06  # of the span of all poles, from which two of them lie too close
-_TOLD = 0.15  # correlation from which a large matrix gives it in figures
 _MARKS = 18  # frequencies of each decade at which a measured response stands beside a model
 
 
@@ -224,10 +221,8 @@ def pole_region(axes: Axes, pole: Pole, color: str) -> None:
     axes.add_patch(Ellipse(centre, width, height, angle=angle, facecolor=color, alpha=0.35, linewidth=0))
 
 
-def poles_panel(
-    poles: Sequence[Pole], table: Sequence[Part], title: str, *, zeros: Sequence[Pole] = (), discrete: bool = False
-) -> Block:
-    """Draw poles and zeros with their 95 % regions and the border of stability, close views, and a table of numbers.
+def poles_panel(poles: Sequence[Pole], title: str, *, zeros: Sequence[Pole] = (), discrete: bool = False) -> Block:
+    """Draw poles and zeros with their 95 % regions and the border of stability, and close views.
 
     Poles that lie too close to be separated on the scale of all of them are drawn again, larger.
     """
@@ -249,24 +244,9 @@ def poles_panel(
         axes.set_ylim(low, high)
         head(axes, f"close view of {len(crowd)} of them")
 
-    def words(axes: Axes) -> None:
-        room, lines = 4.9, table_lines
-        if crowd:
-            room, lines = 3.5, [x for line in lines for x in textwrap.wrap(line, 58, subsequent_indent="    ")]
-        longest = max(map(len, lines), default=1)
-        axes.axis("off")
-        axes.grid(False)
-        axes.text(
-            0.0, 0.97, "\n".join(lines), fontsize=min(8.0, room * 72 / (0.61 * longest)), va="top", family="monospace",
-            transform=axes.transAxes, clip_on=False,
-        )  # fmt: skip
-
-    table_lines = [line for part in table for line in part_lines(part, 10**6)]
     crowd = _crowd([p.value for p in (*poles, *zeros)])
-    columns = [[Panel(draw=every, height=3.0)], [Panel(draw=words, height=0.8 + 0.2 * len(table_lines))]]
-    if crowd:
-        columns.insert(1, [Panel(draw=close, height=3.0)])
-    return Block(columns=columns, widths=(4, 3, 4) if crowd else (1, 1), shared=False)
+    views = (every, close) if crowd else (every,)
+    return Block(columns=[[Panel(draw=view, height=3.0)] for view in views], widths=(4, 3)[: len(views)], shared=False)
 
 
 def _crowd(values: Sequence[complex]) -> list[complex]:
@@ -304,41 +284,3 @@ def _roots(axes: Axes, poles: Sequence[Pole], zeros: Sequence[Pole], *, discrete
     unit = "" if discrete else " [rad/s]"
     axes.set_xlabel(f"real part{unit}")
     axes.set_ylabel(f"imaginary part{unit}")
-
-
-def correlations_panel(names: Sequence[str], covariance: Array, values: Mapping[str, float]) -> Block:
-    """Draw the correlation matrix of estimated parameters, and how well each is known."""
-    sd = np.sqrt(np.diag(covariance))
-    rho = covariance / np.outer(sd, sd)
-    apart = np.abs(rho - np.eye(len(names)))
-    i, j = divmod(int(np.argmax(apart)), len(names))
-
-    def matrix(axes: Axes) -> None:
-        axes.imshow(rho, cmap="PuOr_r", vmin=-1.0, vmax=1.0, aspect="auto")
-        small = len(names) > 8
-        for k, row in enumerate(rho):
-            for m, x in enumerate(row):
-                color = "#fefefe" if abs(x) > 0.75 else "#1b1b1b"  # of no name: cells stay as they are in the dark
-                if not small or abs(x) > _TOLD:
-                    text = f"{x:.1f}" if small else f"{x:.2f}"
-                    axes.text(m, k, text, ha="center", va="center", color=color, fontsize=7.0)
-        axes.set_xticks(range(len(names)), names, rotation=45 if small else 0)
-        axes.set_yticks(range(len(names)), names)
-        axes.grid(False)
-        size = float(np.linalg.cond(rho))
-        condition = f"{size:.0f}" if size < 1e5 else f"{size:.0e}"
-        head(axes, f"largest correlation {names[i]}, {names[j]}: {rho[i, j]:.3f}; condition number {condition}")
-
-    def known(axes: Axes) -> None:
-        size = np.array([abs(values[n]) for n in names])
-        percent = 100 * NORMAL_95 * sd / np.where(size > 0, size, np.nan)
-        at = np.arange(len(names))
-        axes.barh(at, percent, color=[PREDICTED if x < 50 else BOUND for x in percent], height=0.55)
-        log_axis(axes.xaxis, float(np.nanmin(percent)) / 2, float(np.nanmax(percent)))
-        axes.set_yticks(at, names)
-        axes.invert_yaxis()
-        axes.set_xlabel("half of the 95 % interval [% of the value]")
-        head(axes, "how well each parameter is known")
-
-    height = max(2.2, 0.28 * len(names) + 0.6)
-    return Block(columns=[[Panel(draw=draw, height=height)] for draw in (matrix, known)], shared=False)

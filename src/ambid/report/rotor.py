@@ -14,7 +14,7 @@ from ambid.estimation.result import RecordEntry
 from ambid.physics.rotor_model import Bearing, position_role
 from ambid.physics.shaft import Shaft
 from ambid.report.document import Checks, Document, Fitting, Lines, Section, Warnings, grid, timing_section
-from ambid.report.estimate import computing_time, correlations_section, rig_sections, second_section
+from ambid.report.estimate import computing_time, correlations_section, poles_section, rig_sections, second_section
 from ambid.report.numbers import quantity, sized
 from ambid.report.parameters import calibration_lines, parameter_table, short_numbers
 from ambid.report.rotor_drawing import expected_rotor, partners_of, synchronous_sections
@@ -69,10 +69,6 @@ _CAPTIONS: Mapping[str, tuple[str, str]] = {
         "motion at the sensors now and with that correction. Phases count from the mark of angle zero, from x to y.",
     ),
     "poles": ("Poles", "Of the identified rotor in its magnets, in open loop, with their 95 % regions."),
-    "correlations": (
-        "Uncertainty of the parameters",
-        "Parameters with a correlation near ±1 are known only together: what the data show is their combination.",
-    ),
 }
 
 
@@ -122,9 +118,11 @@ def rotor_document(estimate: RotorEstimate, shaft: Shaft | None, evidence: Calla
         return rotor_overview(evidence(), width)
 
     def appendix() -> list[Section]:
+        from ambid.report.rotor_figures import rotor_poles
+
         noise = Section(title="Noise", caption="Levels of white sources, rms of samples.", parts=[grid(noise_rows(e))])
         correlations = correlations_section("Correlations of the estimated numbers", e.covariance_names, e.covariance)
-        return [noise, correlations, *rig_sections(e.rig)]
+        return [noise, correlations, poles_section(rotor_poles(e)), *rig_sections(e.rig)]
 
     records, rig = [RecordEntry.of(r) for r in e.records], str(e.rig.get("name") or "–")
     origin = [(r.name, f"{taken(r)}, SHA-256 {r.sha256 or '–'}") for r in records]

@@ -17,17 +17,7 @@ from ambid.physics.whirl import campbell, free_rotor_of, whirl_sd
 from ambid.record import Record
 from ambid.report.drawing import MEASURED, PREDICTED, WIDE, Block, Panel, head, log_axis, panel, stacked
 from ambid.report.numbers import prefixed, response_unit
-from ambid.report.parameters import pole_table
-from ambid.report.response_panels import (
-    Pole,
-    correlations_panel,
-    frequency_grid,
-    magnitude_axis,
-    marks,
-    phase_axis,
-    poles_panel,
-    roots,
-)
+from ambid.report.response_panels import Pole, frequency_grid, magnitude_axis, marks, phase_axis, poles_panel, roots
 from ambid.report.rotor_drawing import balance_block, campbell_panel, orbit_blocks, shapes_block
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.replay import RotorReplay, at_speed, point_of, slopes
@@ -90,14 +80,7 @@ class RotorEvidence:
         unbalance = balance_block(e.synchronous) if e.synchronous else None
         if unbalance is not None:
             blocks["unbalance"] = unbalance
-        spectrum = rotor_poles(e)
-        table = pole_table([(p.value, p.covariance) for p in spectrum if p.value.imag >= 0], times=True)
-        blocks["poles"] = poles_panel(spectrum, table, "poles of the identified rotor in its magnets, open loop")
-        # of the parameters, in the order of the rig, and of the modes' frequencies and dampings
-        modes = [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
-        variances = dict(zip(e.covariance_names, np.diag(e.covariance).tolist(), strict=True))
-        names = [name for name in (*(p.name for p in e.parameters), *modes) if variances.get(name, 0.0) > 0.0]
-        blocks["correlations"] = correlations_panel(names, e.covariance_of(tuple(names)), e.numbers)
+        blocks["poles"] = poles_panel(rotor_poles(e), "poles of the identified rotor in its magnets, open loop")
         return blocks
 
 
