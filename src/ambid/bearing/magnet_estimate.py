@@ -54,7 +54,7 @@ def estimate_bearing(
     *,
     laws: Sequence[MagnetLaw],
     delay: float | None = None,
-    extend: Sequence[str] = tuple(PARTS),
+    extend: Sequence[str] = (*PARTS, "drift"),
     white: Callable[[BearingFit], bool] | None = None,
     eddy: bool = False,
     drift: bool = False,
@@ -65,7 +65,8 @@ def estimate_bearing(
     """Estimate one nonlinear bearing from several `records`, at least one of a free rotor. `laws`: the likelihood
     chooses; `extend`: parts that they may take on (BIC), saturation only with residuals that are `white`, or it would
     take up any misfit; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force behind a pole
-    a/(s + a); `drift`: a slowly walking force, what the law leaves over; `seed`: of the global search, told by the
+    a/(s + a); `drift`: a force that is forgotten in `tau` and a voltage
+    that walks, both driven by noise, for sure, not only where they pay; `seed`: of the global search, told by the
     fit's `global_search`; a KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
     """
     free = [r for r in records if not r.held]
@@ -93,6 +94,7 @@ def estimate_bearing(
             fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
             near = _CLOSE if fit.status == "converged" else _FAR
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
+        fit = _drifting(fit, parameters, again) if "drift" in extend else fit
         if "saturation" in extend:
             richer = _extended(fit, "saturation", parameters, short, linear, again)
             same = richer.problem.law == fit.problem.law
@@ -155,7 +157,7 @@ def _first(
     problem = BearingProblem(
         law=law,
         records=tuple(records),
-        numbers=_with_eddy(start_numbers(law, parameters, records, linear), parameters, on=eddy),
+        numbers=_acting(start_numbers(law, parameters, records, linear), parameters, eddy=eddy, drift=drift),
         delays=delays,
         free_delay=frozenset(r for r in delays if delay is None and (r != rate or whole != round(whole))),
         eddy=eddy,
@@ -167,9 +169,12 @@ def _first(
     return search(problem, problem.start(), iterations=_TRIED, tick=tick)
 
 
-def _with_eddy(numbers: tuple[Number, ...], parameters: Mapping[str, Parameter], *, on: bool) -> tuple[Number, ...]:
-    free = on and ("a" not in parameters or parameters["a"].role != "fixed")
-    return tuple(replace(n, estimated=free) if n.name == "a" else n for n in numbers)
+def _acting(
+    numbers: tuple[Number, ...], parameters: Mapping[str, Parameter], *, eddy: bool, drift: bool
+) -> tuple[Number, ...]:
+    fixed = {name for name, p in parameters.items() if p.role == "fixed"}
+    free = {"a": eddy and "a" not in fixed, "tau": drift and "tau" not in fixed}
+    return tuple(replace(n, estimated=free.get(n.name, n.estimated)) for n in numbers)
 
 
 def _extended(
@@ -200,6 +205,20 @@ def _extended(
         return fit
     richer = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
     return richer if fit.criterion - richer.criterion > price else fit
+
+
+def _drifting(fit: BearingFit, parameters: Mapping[str, Parameter], tick: Tick | None) -> BearingFit:
+    """Return a fit with a force and a voltage that drift beside what it has, where that pays (BIC)."""
+    if fit.problem.drift or fit.status == "failed":
+        return fit
+    numbers = _acting(fit.problem.numbers, parameters, eddy=fit.problem.eddy, drift=True)
+    problem = replace(fit.problem, drift=True, numbers=numbers)
+    price = (problem.size - fit.problem.size) * float(np.log(problem.n_used))
+    at = linearise(problem, _carried(fit, problem))
+    if at is not None and promise(at) < _LIKELY * price:
+        return fit
+    more = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
+    return more if fit.criterion - more.criterion > price else fit
 
 
 def _saturates(fit: BearingFit) -> bool:
@@ -247,8 +266,8 @@ def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:
         for j, level in enumerate(levels):
             if level in had:
                 vector[slot.start + j] = fit.vector[old.noise_slices[r].start + had.index(level)]
-            elif level == LEVELS.index("drift"):  # a hundredth of the force of one sample, at first
-                vector[slot.start + j] = fit.vector[old.noise_slices[r].start + had.index(2)] - np.log(100.0)
+            else:  # drifts: a hundredth of the force and of the voltage of one sample, at first
+                vector[slot.start + j] = fit.vector[old.noise_slices[r].start + had.index(level - 2)] - np.log(100.0)
     return vector
 
 
@@ -286,8 +305,9 @@ def _whole(
     return back if back.status == "converged" and back.criterion - fit.criterion < price else fit
 
 
-_FIXED = frozenset({"c", "g", "a", "i_offset", "v_drop", "i_drop"})  # unless they are named
+_FIXED = frozenset({"c", "g", "a", "i_offset", "v_drop", "i_drop", "tau"})  # unless they are named
 _ROUND = 0.02  # of the largest current: over which the drop of a stage changes its sign, where nothing is said
+_TAU = 0.01  # of a record: time constant of a drifting force, at first
 _LINEAR = 8192  # samples for the linear estimate
 _SHORTEST = 500  # samples of one of its parts
 _WINDOW_S = 0.1  # over which forces are taken to balance
@@ -412,7 +432,14 @@ def start_numbers(
     position, current = np.concatenate([r.kept for r in free]).T
     mass = rig["m"].value if "m" in rig and rig["m"].value is not None else lin["m"]
     gravity = rig["g"].value if "g" in rig and rig["g"].value is not None else 0.0 if law.pair else 9.81
-    guess = {**lin, "m": mass, "g": gravity, "a": 2.0 * np.pi * 200.0, "sigma": 0.05 / np.max(current**2)}
+    guess = {
+        **lin,
+        "m": mass,
+        "g": gravity,
+        "a": 2.0 * np.pi * 200.0,
+        "tau": _TAU * max(r.u.size / r.rate_hz for r in free),
+        "sigma": 0.05 / np.max(current**2),
+    }
     guess |= dict.fromkeys(("x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"), 0.0)
     guess |= {"i_drop": _ROUND * float(np.max(np.abs(current))), "c": 1e-3 * np.sqrt(mass * abs(lin["k_x"]))}
     if law.pair:
@@ -460,7 +487,7 @@ def _number(name: str, parameter: Parameter | None, guess: float, law: MagnetLaw
         return Number(name=name, value=1.0 if name == "i_knee" else 0.0, estimated=False)
     if parameter is None:
         estimated = name not in _FIXED and not (name == "x_offset" and not law.pair)
-        value = guess if estimated or name in ("g", "a", "i_drop") else 0.0
+        value = guess if estimated or name in ("g", "a", "i_drop", "tau") else 0.0
         return Number(name=name, value=value, estimated=estimated, signed=signed, magnitude=magnitude)
     value = guess if parameter.value is None else parameter.value
     if parameter.role != "fixed" and not signed and not value > 0.0:
@@ -475,7 +502,7 @@ def with_noise(problem: BearingProblem, values: Mapping[str, float]) -> BearingP
     """Choose start levels of the noise: what the sensors' roughness says, and process noise by the criterion; m in kg,
     L in H.
     """
-    centre = np.zeros((len(problem.records), 5))
+    centre = np.zeros((len(problem.records), len(LEVELS)))
     for r, record in enumerate(problem.records):
         first, end = max(record.parts, key=lambda part: part[1] - part[0])
         floor = np.log(noise_floor(record.y[first:end]))
@@ -485,8 +512,8 @@ def with_noise(problem: BearingProblem, values: Mapping[str, float]) -> BearingP
             for v in _VOLTAGE:
                 rate = record.rate_hz
                 force, volt = values["m"] * rate**2 * f, values["L"] * rate * v
-                trial = np.array([*floor, floor[0] + np.log(force), floor[1] + np.log(volt), floor[0] + np.log(force)])
-                trial[4] -= np.log(30.0)
+                own = floor + np.log([force, volt])
+                trial = np.concatenate([floor, own, own - np.log(30.0)])
                 alone = replace(alone, noise_center=trial[None, :])
                 value = criterion(alone, alone.start())
                 if value < best or best == np.inf:

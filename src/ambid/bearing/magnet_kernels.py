@@ -1,9 +1,9 @@
 """The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
 
-`theta` (20): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, and the delay beyond
-whole samples. A sensitivity is a lane: of a number, of a delay that becomes shorter instead of longer (`EARLY`: the
-slopes differ where it is whole), or of the logarithm of a noise level. Lanes are the last axis in `X`, factors stand in
-`C`, and states count by a tuple's length, so that the compiler can use vector instructions and unroll.
+`theta` (21): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, tau, and the delay
+beyond whole samples. A sensitivity is a lane: of a number, of a delay that becomes shorter instead of longer (`EARLY`:
+the slopes differ where it is whole), or of the logarithm of a noise level. Lanes are the last axis in `X`, factors
+stand in `C`, and states count by a tuple's length, so that the compiler can use vector instructions and unroll.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ Integers = NDArray[np.int64]
 States = tuple[int, ...]
 
 MAGNET = 9
-MASS, RESISTANCE, DAMPING, GRAVITY, POLE, X_OFF, I_OFF, V_OFF, V_DROP, I_DROP, LATE = range(MAGNET, MAGNET + 11)
+MASS, RESISTANCE, DAMPING, GRAVITY, POLE, X_OFF, I_OFF, V_OFF, V_DROP, I_DROP, TAU, LATE = range(MAGNET, MAGNET + 12)
 EARLY, LEVEL = LATE + 1, LATE + 2
-"""Kinds of lanes: numbers, the delay either way, then five noise levels."""
+"""Kinds of lanes: numbers, the delay either way, then six noise levels."""
 
 PITCH = 32
 """Lanes that there is room for."""
 
+_N = 6  # states that there is room for
 # rows of `X`: state, covariance, each kind of lane but the magnet's, slopes of the law, derivatives of A, F and E, room
-_S, _P, _KIND = 0, 5, 30
-_LAW = _KIND + LEVEL + 5 - MAGNET
-_A, _F, _E = _LAW + 7, _LAW + 32, _LAW + 57
-_U, _K, _SUM, _ROW = _E + 10, _E + 35, _E + 40, _E + 45
+_S, _P, _KIND = 0, _N, _N + _N**2
+_LAW = _KIND + LEVEL + 6 - MAGNET
+_A, _F, _E = _LAW + 7, _LAW + 7 + _N**2, _LAW + 7 + 2 * _N**2
+_U = _E + 2 * _N
+_K, _SUM, _ROW = _U + _N**2, _U + _N**2 + _N, _U + _N**2 + 2 * _N
 ROOM = (_ROW + 2) * PITCH
 """Length of `X`."""
 
@@ -50,15 +52,16 @@ ROOM = (_ROW + 2) * PITCH
     _V_OFF,
     _V_DROP,
     _I_DROP,
+    _TAU,
     _LATE,
     _EARLY,
     _SENSOR,
     _,
     _FORCE,
-) = (PITCH * (_KIND + kind) for kind in range(15))
+) = (PITCH * (_KIND + kind) for kind in range(16))
 
-# places in `C`: A, F, H and T = P F' in rows of five, E in rows of two, then numbers
-_CA, _CF, _CH, _CT, _CE, _CN = 0, 25, 50, 75, 100, 110
+# places in `C`: A, F, H and T = P F' in rows of `_N`, E in rows of two, then numbers
+_CA, _CF, _CH, _CT, _CE, _CN = 0, _N**2, 2 * _N**2, 3 * _N**2, 4 * _N**2, 4 * _N**2 + 2 * _N
 
 _energy: Callable[..., None] = compiled(coenergy_derivatives)
 
@@ -66,19 +69,21 @@ _energy: Callable[..., None] = compiled(coenergy_derivatives)
 @compiled
 def rates(z: Array, volt: float, th: Array, flags: Flags, w: Array, g: Array) -> tuple[float, float]:
     """Write the right-hand side g (n,) at a state under a voltage, by the co-energy's derivatives w (12,): position,
-    velocity, current, force behind the eddy pole, drifting force, as `flags` (exponential, pair, eddy, drift, held)
-    have them. Returns the share of v_drop that transistors and diodes take, and its slope by the current.
+    velocity, current, force behind the eddy pole, drifting force and voltage, as `flags` (exponential, pair, eddy,
+    drift, held) have them. Returns the share of v_drop that transistors and diodes take, and its slope by the current.
     """
-    v, i = z[1], z[2]
+    v, i, force, volt = z[1], z[2], z.size - 2, volt + th[V_OFF]
     if not flags[4]:
         net = (z[3] if flags[2] else w[0]) - th[DAMPING] * v
         if flags[3]:
-            net += z[z.size - 1]
+            net += z[force]
+            g[force] = -z[force] / th[TAU]
+            volt += z[force + 1]
         g[0], g[1] = v, net / th[MASS] + th[GRAVITY]
     if flags[2]:
         g[3] = th[POLE] * (w[0] - z[3])
     share = math.tanh(i / th[I_DROP])
-    g[2] = (volt + th[V_OFF] - th[V_DROP] * share - th[RESISTANCE] * i - w[2] * v) / w[3]
+    g[2] = (volt - th[V_DROP] * share - th[RESISTANCE] * i - w[2] * v) / w[3]
     return share, (1.0 - share * share) / th[I_DROP]
 
 
@@ -89,17 +94,19 @@ def jacobian(z: Array, th: Array, flags: Flags, w: Array, g: Array, steep: float
     if not flags[4]:
         light = 1.0 / th[MASS]
         C[_CA + 1] = 1.0
-        C[_CA + 6] = -th[DAMPING] * light
+        C[_CA + _N + 1] = -th[DAMPING] * light
         if flags[3]:
-            C[_CA + 4 + z.size] = light
+            force = z.size - 2
+            C[_CA + _N + force], C[_CA + 2 * _N + force + 1] = light, per
+            C[_CA + (_N + 1) * force] = -1.0 / th[TAU]
         if flags[2]:
-            C[_CA + 8] = light
-            C[_CA + 15], C[_CA + 17], C[_CA + 18] = th[POLE] * w[1], th[POLE] * w[2], -th[POLE]
+            C[_CA + _N + 3] = light
+            C[_CA + 3 * _N], C[_CA + 3 * _N + 2], C[_CA + 3 * _N + 3] = th[POLE] * w[1], th[POLE] * w[2], -th[POLE]
         else:
-            C[_CA + 5], C[_CA + 7] = w[1] * light, w[2] * light
-    C[_CA + 10] = (-w[5] * v - g[2] * w[6]) * per
-    C[_CA + 11] = -w[2] * per
-    C[_CA + 12] = (-th[RESISTANCE] - th[V_DROP] * steep - w[6] * v - g[2] * w[7]) * per
+            C[_CA + _N], C[_CA + _N + 2] = w[1] * light, w[2] * light
+    C[_CA + 2 * _N] = (-w[5] * v - g[2] * w[6]) * per
+    C[_CA + 2 * _N + 1] = -w[2] * per
+    C[_CA + 2 * _N + 2] = (-th[RESISTANCE] - th[V_DROP] * steep - w[6] * v - g[2] * w[7]) * per
 
 
 @compiled
@@ -127,6 +134,7 @@ def _stage_factors(
     C[_CN + 10], C[_CN + 11] = -share * per, th[V_DROP] * steep * i / th[I_DROP] * per
     C[_CN + 12] = th[POLE] if flags[2] else 0.0
     C[_CN + 13] = w[0] - z[3] if flags[2] else 0.0
+    C[_CN + 14] = z[z.size - 2] / th[TAU] ** 2 if flags[3] else 0.0
 
 
 @compiled(fastmath={"contract"})
@@ -135,7 +143,7 @@ def _stage_lanes(states: States, p: int, forth: float, weight: float, C: Array, 
     n = len(states)
     m0, m1, m2, m3 = C[_CN], C[_CN + 1], C[_CN + 2], C[_CN + 3]
     e0, e1, e2, e3, e4 = C[_CN + 4], C[_CN + 5], C[_CN + 6], C[_CN + 7], C[_CN + 8]
-    e5, e6, e7, f0, f1 = C[_CN + 9], C[_CN + 10], C[_CN + 11], C[_CN + 12], C[_CN + 13]
+    e5, e6, e7, f0, f1, f2 = C[_CN + 9], C[_CN + 10], C[_CN + 11], C[_CN + 12], C[_CN + 13], C[_CN + 14]
     for j in range(min(p, PITCH)):
         for a in range(n):
             X[(_U + a) * PITCH + j] = X[(_S + a) * PITCH + j] + forth * X[(_K + a) * PITCH + j]
@@ -149,10 +157,11 @@ def _stage_lanes(states: States, p: int, forth: float, weight: float, C: Array, 
         )  # fmt: skip
         if n > 3:
             X[(_K + 3) * PITCH + j] = f0 * pull + f1 * X[_POLE + j]
+            X[(_K + n - 2) * PITCH + j] += f2 * X[_TAU + j]
         for a in range(n):
             s = X[(_K + a) * PITCH + j]
             for c in range(n):
-                s += C[_CA + 5 * a + c] * X[(_U + c) * PITCH + j]
+                s += C[_CA + _N * a + c] * X[(_U + c) * PITCH + j]
             X[(_K + a) * PITCH + j] = s
             X[(_SUM + a) * PITCH + j] += weight * s
 
@@ -201,15 +210,17 @@ def _bend(
     drop: tuple[float, float], C: Array, X: Array,
 ) -> None:  # fmt: skip
     """Write the derivatives of A, F and E of `_spread` by all lanes: by themselves, and through the state."""
-    n = len(states)
+    n, force = len(states), max(len(states) - 2, 3)
     v, i, m, rate, (share, steep) = z[1], z[2], th[MASS], g[2], drop
     free, eddy, drift = (0.0 if flags[4] else 1.0), (1.0 if flags[2] else 0.0), (1.0 if flags[3] else 0.0)
     light, heavy, per = free / m, -free / (m * m), 1.0 / w[3]
     near, through, pole = light * (1.0 - eddy), heavy * (1.0 - eddy), th[POLE] * eddy
     R, wide, damping = th[RESISTANCE], th[I_DROP], th[DAMPING]
+    faster = 1.0 / th[TAU] ** 2 if flags[3] else 0.0
     slope, curl, turn = th[V_DROP] * steep, 2.0 * share / wide, i / wide
     w1, w2, w4, w5, w6, w7, w8, w9, w10, w11 = w[1], w[2], w[4], w[5], w[6], w[7], w[8], w[9], w[10], w[11]
-    a20, a21, a22, late, early, half = C[_CA + 10], C[_CA + 11], C[_CA + 12], volts[2], volts[4], 0.5 * h * h
+    a20, a21, a22 = C[_CA + 2 * _N], C[_CA + 2 * _N + 1], C[_CA + 2 * _N + 2]
+    late, early, half = volts[2], volts[4], 0.5 * h * h
     for j in range(min(p, PITCH)):
         dx, dv, di = X[_S * PITCH + j], X[(_S + 1) * PITCH + j], X[(_S + 2) * PITCH + j]
         dm, d_R, d_drop, d_wide = X[_MASS + j], X[_RESISTANCE + j], X[_V_DROP + j], X[_I_DROP + j]
@@ -219,27 +230,33 @@ def _bend(
         xxi = w8 * dx + w9 * di + X[(_LAW + 4) * PITCH + j]
         xii = w9 * dx + w10 * di + X[(_LAW + 5) * PITCH + j]
         iii = w10 * dx + w11 * di + X[(_LAW + 6) * PITCH + j]
-        X[(_A + 5) * PITCH + j] = near * xx + through * w1 * dm
-        X[(_A + 6) * PITCH + j] = -light * X[_DAMPING + j] - heavy * damping * dm
-        X[(_A + 7) * PITCH + j] = near * xi + through * w2 * dm
+        X[(_A + _N) * PITCH + j] = near * xx + through * w1 * dm
+        X[(_A + _N + 1) * PITCH + j] = -light * X[_DAMPING + j] - heavy * damping * dm
+        X[(_A + _N + 2) * PITCH + j] = near * xi + through * w2 * dm
         if n > 3:
-            X[(_A + 8) * PITCH + j] = heavy * eddy * dm
+            X[(_A + _N + 3) * PITCH + j] = heavy * eddy * dm
             d_pole = eddy * X[_POLE + j]
-            X[(_A + 15) * PITCH + j] = pole * xx + w1 * d_pole
-            X[(_A + 17) * PITCH + j] = pole * xi + w2 * d_pole
-            X[(_A + 18) * PITCH + j] = -d_pole
-            X[(_A + 4 + n) * PITCH + j] += heavy * drift * dm
+            X[(_A + 3 * _N) * PITCH + j] = pole * xx + w1 * d_pole
+            X[(_A + 3 * _N + 2) * PITCH + j] = pole * xi + w2 * d_pole
+            X[(_A + 3 * _N + 3) * PITCH + j] = -d_pole
+            X[(_A + _N + force) * PITCH + j] += heavy * drift * dm
+            X[(_A + (_N + 1) * force) * PITCH + j] += faster * X[_TAU + j]
         d_volt = X[_V_OFF + j] + late * X[_LATE + j] + early * X[_EARLY + j] - share * d_drop
         d_volt -= slope * (di - turn * d_wide) + d_R * i + R * di + xi * v + w2 * dv
+        if n > 4:
+            d_volt += X[(_S + force + 1) * PITCH + j]
+            X[(_A + 2 * _N + force + 1) * PITCH + j] = -drift * ii * per * per
         d_rate = (d_volt - rate * ii) * per
         d_slope = steep * d_drop + slope * ((curl * i - 1.0) / wide * d_wide - curl * di)
-        X[(_A + 10) * PITCH + j] = -(xxi * v + w5 * dv + d_rate * w6 + rate * xii + a20 * ii) * per
-        X[(_A + 11) * PITCH + j] = -(xi + a21 * ii) * per
-        X[(_A + 12) * PITCH + j] = -(d_R + d_slope + xii * v + w6 * dv + d_rate * w7 + rate * iii + a22 * ii) * per
+        X[(_A + 2 * _N) * PITCH + j] = -(xxi * v + w5 * dv + d_rate * w6 + rate * xii + a20 * ii) * per
+        X[(_A + 2 * _N + 1) * PITCH + j] = -(xi + a21 * ii) * per
+        X[(_A + 2 * _N + 2) * PITCH + j] = (
+            -(d_R + d_slope + xii * v + w6 * dv + d_rate * w7 + rate * iii + a22 * ii) * per
+        )
         d_light, d_per = heavy * dm, -ii * per * per
         for a in range(n):
-            by_force = X[(_A + 5 * a + 1) * PITCH + j] * light + C[_CA + 5 * a + 1] * d_light
-            by_volt = X[(_A + 5 * a + 2) * PITCH + j] * per + C[_CA + 5 * a + 2] * d_per
+            by_force = X[(_A + _N * a + 1) * PITCH + j] * light + C[_CA + _N * a + 1] * d_light
+            by_volt = X[(_A + _N * a + 2) * PITCH + j] * per + C[_CA + _N * a + 2] * d_per
             X[(_E + 2 * a) * PITCH + j] = half * by_force
             X[(_E + 2 * a + 1) * PITCH + j] = half * by_volt
         X[(_E + 2) * PITCH + j] += h * d_light
@@ -248,11 +265,11 @@ def _bend(
             for b in range(n):
                 s = 0.0
                 for c in range(1, n):
-                    s += C[_CH + 5 * a + c] * X[(_A + 5 * c + b) * PITCH + j]
+                    s += C[_CH + _N * a + c] * X[(_A + _N * c + b) * PITCH + j]
                 if a > 0:
                     for c in range(n):
-                        s += X[(_A + 5 * a + c) * PITCH + j] * C[_CH + 5 * c + b]
-                X[(_F + 5 * a + b) * PITCH + j] = s
+                        s += X[(_A + _N * a + c) * PITCH + j] * C[_CH + _N * c + b]
+                X[(_F + _N * a + b) * PITCH + j] = s
 
 
 @compiled(fastmath={"contract"})
@@ -264,36 +281,36 @@ def _double(states: States, p: int, C: Array, X: Array) -> None:
             for d in range(2):
                 s = X[(_E + 2 * a + d) * PITCH + j]
                 for c in range(n):
-                    s += X[(_F + 5 * a + c) * PITCH + j] * C[_CE + 2 * c + d]
-                    s += C[_CF + 5 * a + c] * X[(_E + 2 * c + d) * PITCH + j]
+                    s += X[(_F + _N * a + c) * PITCH + j] * C[_CE + 2 * c + d]
+                    s += C[_CF + _N * a + c] * X[(_E + 2 * c + d) * PITCH + j]
                 X[(_K + 2 * a + d) * PITCH + j] = s
             for b in range(n):
                 s = 0.0
                 for c in range(n):
-                    s += X[(_F + 5 * a + c) * PITCH + j] * C[_CF + 5 * c + b]
-                    s += C[_CF + 5 * a + c] * X[(_F + 5 * c + b) * PITCH + j]
-                X[(_U + 5 * a + b) * PITCH + j] = s
+                    s += X[(_F + _N * a + c) * PITCH + j] * C[_CF + _N * c + b]
+                    s += C[_CF + _N * a + c] * X[(_F + _N * c + b) * PITCH + j]
+                X[(_U + _N * a + b) * PITCH + j] = s
         for a in range(n):
             for d in range(2):
                 X[(_E + 2 * a + d) * PITCH + j] = X[(_K + 2 * a + d) * PITCH + j]
             for b in range(n):
-                X[(_F + 5 * a + b) * PITCH + j] = X[(_U + 5 * a + b) * PITCH + j]
+                X[(_F + _N * a + b) * PITCH + j] = X[(_U + _N * a + b) * PITCH + j]
     for a in range(n):  # T serves as room
         for d in range(2):
             s = C[_CE + 2 * a + d]
             for c in range(n):
-                s += C[_CF + 5 * a + c] * C[_CE + 2 * c + d]
+                s += C[_CF + _N * a + c] * C[_CE + 2 * c + d]
             C[_CN + 2 * a + d] = s
         for b in range(n):
             s = 0.0
             for c in range(n):
-                s += C[_CF + 5 * a + c] * C[_CF + 5 * c + b]
-            C[_CT + 5 * a + b] = s
+                s += C[_CF + _N * a + c] * C[_CF + _N * c + b]
+            C[_CT + _N * a + b] = s
     for a in range(n):
         for d in range(2):
             C[_CE + 2 * a + d] = C[_CN + 2 * a + d]
         for b in range(n):
-            C[_CF + 5 * a + b] = C[_CT + 5 * a + b]
+            C[_CF + _N * a + b] = C[_CT + _N * a + b]
 
 
 @compiled(fastmath={"contract"})
@@ -305,8 +322,8 @@ def _spread_lanes(states: States, p: int, drift: bool, q2: Array, C: Array, X: A
             for b in range(n):
                 s = 0.0
                 for c in range(n):
-                    s += C[_CF + 5 * a + c] * X[(_P + 5 * c + b) * PITCH + j]
-                X[(_U + 5 * a + b) * PITCH + j] = s
+                    s += C[_CF + _N * a + c] * X[(_P + _N * c + b) * PITCH + j]
+                X[(_U + _N * a + b) * PITCH + j] = s
         for a in range(n):
             for b in range(a, n):
                 s = 0.0
@@ -315,14 +332,15 @@ def _spread_lanes(states: States, p: int, drift: bool, q2: Array, C: Array, X: A
                     s += q2[d] * (g * X[(_E + 2 * a + d) * PITCH + j] + f * X[(_E + 2 * b + d) * PITCH + j])
                     s += f * g * X[_FORCE + d * PITCH + j]
                 for c in range(n):
-                    s += X[(_U + 5 * a + c) * PITCH + j] * C[_CF + 5 * b + c]
-                    s += X[(_F + 5 * a + c) * PITCH + j] * C[_CT + 5 * c + b]
-                    s += X[(_F + 5 * b + c) * PITCH + j] * C[_CT + 5 * c + a]
-                X[(_P + 5 * a + b) * PITCH + j] = s
-                X[(_P + 5 * b + a) * PITCH + j] = s
+                    s += X[(_U + _N * a + c) * PITCH + j] * C[_CF + _N * b + c]
+                    s += X[(_F + _N * a + c) * PITCH + j] * C[_CT + _N * c + b]
+                    s += X[(_F + _N * b + c) * PITCH + j] * C[_CT + _N * c + a]
+                X[(_P + _N * a + b) * PITCH + j] = s
+                X[(_P + _N * b + a) * PITCH + j] = s
     if drift:
         for j in range(min(p, PITCH)):
-            X[(_P + 6 * (n - 1)) * PITCH + j] += X[_FORCE + 2 * PITCH + j]
+            X[(_P + (_N + 1) * (n - 2)) * PITCH + j] += X[_FORCE + 2 * PITCH + j]
+            X[(_P + (_N + 1) * (n - 1)) * PITCH + j] += X[_FORCE + 3 * PITCH + j]
 
 
 @compiled
@@ -332,8 +350,8 @@ def _spread(
 ) -> None:  # fmt: skip
     """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F = I + h A + (h A)^2/2 and E = h (I + h
     A/2) B of a step, put together over `steps`, a power of two; A is the Jacobian where the sample begins, under its
-    mean voltage. `q2`: variances of force, voltage and drift, with what is not known of force and voltage of this
-    sample.
+    mean voltage. `q2`: variances of force, voltage and their drifts, with what is not known of force and voltage of
+    this sample.
     """
     n = len(states)
     h /= steps
@@ -345,20 +363,22 @@ def _spread(
         for b in range(n):
             s = 0.0
             for c in range(n):
-                s += C[_CA + 5 * a + c] * C[_CA + 5 * c + b]
-            C[_CF + 5 * a + b] = h * C[_CA + 5 * a + b] + half * s
-            C[_CH + 5 * a + b] = half * C[_CA + 5 * a + b]  # dF = H dA + dA H
-        C[_CF + 6 * a] += 1.0
-        C[_CH + 6 * a] += 0.5 * h
-        C[_CE + 2 * a] = half * C[_CA + 5 * a + 1] * light
-        C[_CE + 2 * a + 1] = half * C[_CA + 5 * a + 2] * per
+                s += C[_CA + _N * a + c] * C[_CA + _N * c + b]
+            C[_CF + _N * a + b] = h * C[_CA + _N * a + b] + half * s
+            C[_CH + _N * a + b] = half * C[_CA + _N * a + b]  # dF = H dA + dA H
+        C[_CF + (_N + 1) * a] += 1.0
+        C[_CH + (_N + 1) * a] += 0.5 * h
+        C[_CE + 2 * a] = half * C[_CA + _N * a + 1] * light
+        C[_CE + 2 * a + 1] = half * C[_CA + _N * a + 2] * per
     C[_CE + 2] += h * light
     C[_CE + 5] += h * per
     if p:
         _law_lanes(active, chain, dw, X)
         if n > 3:
+            force = max(n - 2, 3)
             for j in range(p):
-                X[(_A + 4 + n) * PITCH + j] = 0.0
+                X[(_A + _N + force) * PITCH + j] = 0.0
+                X[(_A + (_N + 1) * force) * PITCH + j] = 0.0
         _bend(states, p, z, th, flags, volts, h, w, g, drop, C, X)
     done = 1
     while done < steps:
@@ -368,19 +388,20 @@ def _spread(
         for b in range(n):
             s = 0.0
             for c in range(n):
-                s += P[a, c] * C[_CF + 5 * b + c]
-            C[_CT + 5 * a + b] = s
+                s += P[a, c] * C[_CF + _N * b + c]
+            C[_CT + _N * a + b] = s
     if p:
         _spread_lanes(states, p, flags[3], q2, C, X)
     for a in range(n):
         for b in range(a, n):
             s = C[_CE + 2 * a] * C[_CE + 2 * b] * q2[0] + C[_CE + 2 * a + 1] * C[_CE + 2 * b + 1] * q2[1]
             for c in range(n):
-                s += C[_CF + 5 * a + c] * C[_CT + 5 * c + b]
+                s += C[_CF + _N * a + c] * C[_CT + _N * c + b]
             P[a, b] = s
             P[b, a] = s
     if flags[3]:
-        P[n - 1, n - 1] += q2[2]
+        P[n - 2, n - 2] += q2[2]
+        P[n - 1, n - 1] += q2[3]
 
 
 @compiled(fastmath={"contract"})
@@ -399,8 +420,8 @@ def _correct_lanes(states: States, p: int, e: float, s: float, C: Array, X: Arra
             gain = C[_CN + a] * per
             for b in range(a, n):
                 t = X[(_U + a) * PITCH + j] * C[_CN + b] + gain * X[(_K + b) * PITCH + j]
-                X[(_P + 5 * a + b) * PITCH + j] -= t
-                X[(_P + 5 * b + a) * PITCH + j] = X[(_P + 5 * a + b) * PITCH + j]
+                X[(_P + _N * a + b) * PITCH + j] -= t
+                X[(_P + _N * b + a) * PITCH + j] = X[(_P + _N * a + b) * PITCH + j]
 
 
 @compiled
@@ -418,10 +439,10 @@ def _correct(
     if p:
         for j in range(p):
             X[_ROW * PITCH + j] = X[(_S + at) * PITCH + j] + X[_X_OFF + o * PITCH + j]
-            X[(_ROW + 1) * PITCH + j] = X[(_P + 6 * at) * PITCH + j] + X[_SENSOR + o * PITCH + j]
+            X[(_ROW + 1) * PITCH + j] = X[(_P + (_N + 1) * at) * PITCH + j] + X[_SENSOR + o * PITCH + j]
         for a in range(n):
             for j in range(p):
-                X[(_K + a) * PITCH + j] = X[(_P + 5 * a + at) * PITCH + j]
+                X[(_K + a) * PITCH + j] = X[(_P + _N * a + at) * PITCH + j]
         _correct_lanes(states, p, e, s, C, X)
         p = rows.shape[1] - 1
         for j in range(p):
@@ -444,14 +465,14 @@ def predict(
     `loose` (n,) its unknown variance, `knock` (n, 2) that of force and back-EMF; `y`, `valid` (n, 2): position and
     current, and whether measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or
     twice the square of a level; without lanes the criterion alone. `noise2`: squared levels of position, current,
-    force, voltage and drift (of one sample). `z`, `P`, `X` (`ROOM`,; zero at first), state, covariance and derivatives
-    before `first`, move along; `e`, `s` (n, 2) get innovations and variances, `rows` (4 (end - first), p + 1) the
+    force, voltage and their drifts (of one sample). `z`, `P`, `X` (`ROOM`,; zero at first), state, covariance and
+    derivatives before `first`, move along; `e`, `s` (n, 2) get innovations and variances, `rows` (4 (end - first), p + 1) the
     likelihood's.
     """
     n = len(states)
     p = min((active.size + 7) // 8 * 8, PITCH)  # a few stay empty, so that vector instructions leave none over
-    w, dw, C = np.zeros(12), np.zeros((7, MAGNET)), np.zeros(_CN + 14)
-    g, at, to, volts, q2 = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6), np.zeros(3)
+    w, dw, C = np.zeros(12), np.zeros((7, MAGNET)), np.zeros(_CN + 15)
+    g, at, to, volts, q2 = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6), np.zeros(4)
     for j in range(active.size):
         if active[j] >= MAGNET:
             X[(_KIND + active[j] - MAGNET) * PITCH + j] = chain[j]
@@ -470,7 +491,7 @@ def predict(
             volts[4], volts[5] = now - soon, -6.0 * (soon - now)
         q2[0] = noise2[2] + knock[k, 0]
         q2[1] = noise2[3] + max(loose[k - whole - 1], loose[k - whole]) + knock[k, 1]
-        q2[2] = noise2[4]
+        q2[2], q2[3] = noise2[4], noise2[5]
         _spread(states, p, z, P, th, active, chain, flags, q2, volts, h, steps, w, dw, g, C, X)
         _advance(states, p, z, th, active, chain, flags, volts, h, steps, w, dw, g, at, to, C, X)
         low, high = z[0] + th[1], th[1] - z[0]

@@ -163,7 +163,7 @@ def _through(problem: BearingProblem, record: BearingRecord) -> float:
 def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]:
     """State before sample `begin`, and its covariance, which is generous and does not depend on the vector."""
     record, flags = problem.records[r], problem.flags(r)
-    rate, n = record.rate_hz, 3 + int(flags[2]) + int(flags[3])
+    rate, n = record.rate_hz, 3 + int(flags[2]) + 2 * int(flags[3])
     noise, begun = np.exp(problem.noise_center[r]), {n.name: n.value for n in problem.numbers}
     first = record.y[max(begin - _ABOUT, 0) : begin + _ABOUT]
     x = record.y[:, 0].mean() if record.held else first[:, 0].mean()
@@ -186,7 +186,7 @@ def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]
             z[3] = problem.law.table(z[:1], z[2:3], begun)[0][0, 0]
             P[3, 3] += z[3] ** 2
     if flags[3]:
-        P[-1, -1] = (10.0 * noise[2]) ** 2
+        P[-2, -2], P[-1, -1] = (10.0 * noise[2]) ** 2, noise[5] ** 2  # v_offset is the voltage's beginning
     return z, P
 
 

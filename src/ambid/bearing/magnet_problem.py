@@ -20,7 +20,7 @@ from ambid.estimation.predictor import noise_floor
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.loop import Interval
 
-BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset", "v_drop", "i_drop")
+BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset", "v_drop", "i_drop", "tau")
 """Numbers after those of the magnet, in the order of the kernels."""
 
 SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"})
@@ -29,15 +29,18 @@ SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset", "v_drop", "k_asym",
 UNITS: Mapping[str, str] = {
     "k": "N m^2/A^2", "s": "m", "L_g": "H", "zeta": "m", "sigma": "1/A^2", "L_leak": "H", "L_rise": "H", "i_knee": "A",
     "i0": "A", "m": "kg", "R": "ohm", "c": "N s/m", "g": "m/s^2", "a": "rad/s", "x_offset": "m", "i_offset": "A",
-    "v_offset": "V", "v_drop": "V", "i_drop": "A", "k_asym": "1", "i0_asym": "A",
+    "v_offset": "V", "v_drop": "V", "i_drop": "A", "tau": "s", "k_asym": "1", "i0_asym": "A",
 }  # fmt: skip
 """SI unit of every number."""
 
-LEVELS = ("position", "current", "force", "voltage", "drift")
-"""Noise levels in the order of the kernels: rms of one sample, the last three held over it."""
+LEVELS = ("position", "current", "force", "voltage", "drift", "voltage_drift")
+"""Noise levels in the order of the kernels: rms of one sample, the last four held over it."""
 
 EDDY_STEPS = 8
 """Steps in a sample where there is an eddy pole; it may be as fast as one of them."""
+
+FORGETS = 20.0
+"""Time constants of a drifting force that a record holds at least, so that its mean is small beside its size."""
 
 NOISE_PRIOR_SD = 5.0
 """Of a log noise level: keeps a level that the data do not see from running to minus infinity."""
@@ -110,9 +113,9 @@ class BearingProblem:
     numbers: tuple[Number, ...]  # one for each name of the law and of `BODY`, in that order
     delays: Mapping[float, float]  # by sampling rate: delay of the voltage in samples (start where free)
     free_delay: frozenset[float]  # rates at which it is estimated
-    eddy: bool  # whether the force has a pole a/(s + a), and whether a random-walk force acts
+    eddy: bool  # whether the force has a pole a/(s + a), and whether force and voltage drift
     drift: bool
-    noise_center: Array  # (n_records, 5), centres of the weak prior on log noise levels
+    noise_center: Array  # (n_records, 6), centres of the weak prior on log noise levels
     skip: int = 8  # samples left out at the start of each record
     substeps: int = 1  # runge-Kutta steps in a sample, at least; a power of two
 
@@ -135,7 +138,7 @@ class BearingProblem:
         """Return which noise levels record `r` has, as places in `LEVELS`."""
         if self.records[r].held:
             return (1, 3)
-        return (0, 1, 2, 3, 4) if self.drift else (0, 1, 2, 3)
+        return (0, 1, 2, 3, 4, 5) if self.drift else (0, 1, 2, 3)
 
     @property
     def noise_slices(self) -> tuple[slice, ...]:
@@ -168,11 +171,16 @@ class BearingProblem:
         return vector
 
     def upper(self) -> Array:
-        """Return the largest values of the vector, in shape (size,): an eddy pole faster than a step cannot be seen."""
+        """Return the largest values of the vector, in shape (size,): an eddy pole faster than a step cannot be seen,
+        nor a force that drifts more slowly than `FORGETS` be told from one of the law.
+        """
+        free = [r for r in self.records if not r.held]
+        most = {
+            "a": EDDY_STEPS * min(r.rate_hz for r in free),
+            "tau": min(r.u.size / r.rate_hz for r in free) / FORGETS,
+        }
         bounds = np.full(self.size, np.inf)
-        if self.eddy:
-            rate = min(r.rate_hz for r in self.records if not r.held)
-            bounds[[j for j, n in enumerate(self.estimated) if n.name == "a"]] = np.log(EDDY_STEPS * rate)
+        bounds[: len(self.estimated)] = [np.log(most.get(n.name, np.inf)) for n in self.estimated]
         return bounds
 
     def values(self, vector: Array) -> dict[str, float]:
@@ -194,7 +202,7 @@ class BearingProblem:
         return self.delays[rate_hz]
 
     def theta(self, vector: Array, rate_hz: float) -> tuple[Array, int]:
-        """Return the kernels' numbers (20,) at a vector, and the whole samples of delay at a rate."""
+        """Return the kernels' numbers (21,) at a vector, and the whole samples of delay at a rate."""
         values, delay = self.values(vector), self.delay_at(vector, rate_hz)
         whole = int(np.floor(delay))
         body = [values[name] for name in BODY]
@@ -207,7 +215,7 @@ class BearingProblem:
         return np.array([self.law.gap == "exponential", self.law.pair, eddy, drift, held])
 
     def noise2(self, vector: Array, r: int) -> Array:
-        """Return the squared noise levels (5,) of record number `r`."""
+        """Return the squared noise levels (6,) of record number `r`."""
         squares = np.zeros(len(LEVELS))
         squares[list(self.levels(r))] = np.exp(2.0 * vector[self.noise_slices[r]])
         return squares

@@ -172,11 +172,11 @@ class BearingCost:
 
 def _levels(problem: BearingProblem, values: dict[str, float], force: float, voltage: float) -> Array:
     """Noise levels of each record, from what its sensors' roughness says (as `with_noise` has them)."""
-    centre = np.zeros((len(problem.records), 5))
+    centre = np.zeros_like(problem.noise_center)
     for r, record in enumerate(problem.records):
         floor, rate = np.log(noise_floor(record.kept)), record.rate_hz
-        push = floor[0] + np.log(values["m"] * rate**2 * force)
-        centre[r] = [*floor, push, floor[1] + np.log(values["L_leak"] * rate * voltage), push - np.log(30.0)]
+        own = floor + np.log([values["m"] * rate**2 * force, values["L_leak"] * rate * voltage])
+        centre[r] = np.concatenate([floor, own, own - np.log(30.0)])
     return centre
 
 

@@ -81,7 +81,9 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     law : MagnetLaw
         Which co-energy.
     eddy, drift : bool
-        Whether the force has a pole a/(s + a), and whether a slowly walking force was allowed for.
+        Whether the force has a pole a/(s + a), and whether a force and a voltage may drift.
+    extended : tuple of str
+        What the model was extended by because it pays: drift.
     records : tuple of Mapping
         ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` of each.
     parameters : tuple of EstimatedParameter
@@ -93,7 +95,7 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     delay : Mapping[str, Delay]
         Of the voltage, by sampling rate such as ``"1000 Hz"``.
     noise : Mapping[str, Mapping[str, float]]
-        By record: levels in m, A, N, V, N (rms of one sample).
+        By record: levels in m, A, N, V, and of drifts in N and V (rms of one sample).
     fit : Mapping[str, Mapping[str, OutputFit]]
         By record and output.
     range, usual : Mapping[str, (float, float)]
@@ -136,6 +138,7 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
     validation: Mapping[str, object] | None = None
     warnings: tuple[str, ...] = ()
+    extended: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
 

@@ -414,7 +414,8 @@ def identify_nonlinear(
     validate : as one of the `records`, optional
         A further record, of a rotor that moves, to validate the estimate on.
     eddy, drift : bool, optional
-        Estimate an eddy pole, or a resistance that drifts, where the rig does not say so.
+        Estimate an eddy pole, or a force and a voltage that drift, where the rig does not say so; a drift also where
+        it pays.
     from_s, to_s, rate_hz, gaps, units, layout : optional
         As `identify`; the part of every record in which the rotor moves.
     tick : callable, optional

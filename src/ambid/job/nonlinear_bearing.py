@@ -106,7 +106,7 @@ def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[M
         MagnetLaw(gap=gap, pair=pair, asymmetric=bool(magnet.asymmetric), saturation=saturation, rise=rise)
         for gap in gaps
     ]
-    return laws, [part for part in PARTS if getattr(magnet, part) is None]
+    return laws, [*(part for part in PARTS if getattr(magnet, part) is None), "drift"]
 
 
 def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
@@ -279,8 +279,8 @@ def judge_bearing(
     moves = [alone.beyond_chance(), agreement(fit, spread, alone=False).beyond_chance()] if robust else []
     told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig)
     spread = replace(spread, disagreement=np.vstack([*moves, contradicted]))
-    robust = robust or len(contradicted) > 0
-    parameters = _parameters(fit, spread, robust=robust)
+    wide = robust or len(contradicted) > 0
+    parameters = _parameters(fit, spread, robust=wide)
     checks = {**told, **residuals, "identifiable": _shown(parameters)} | _gravity(fit)
     noise = {
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
@@ -293,13 +293,14 @@ def judge_bearing(
     return NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
         law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in readings),
-        parameters=parameters, covariance_names=spread.names, covariance=spread.covariance(robust=robust),
-        covariance_method="robust" if robust else "information", delay=delays,
+        parameters=parameters, covariance_names=spread.names, covariance=spread.covariance(robust=wide),
+        covariance_method="robust" if wide else "information", delay=delays,
         noise=noise, fit=_fits(fit, tests, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
         usual=_between(*np.quantile(moving, (0.025, 0.975), axis=0)),
         operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),
         hull=_hull(moving), coil_hull=_hull(points), criterion=fit.criterion,
         bic=fit.criterion + problem.size * float(np.log(problem.n_used)), checks=checks,
+        extended=("drift",) * (problem.drift and not (rig.magnet is not None and rig.magnet.drift)),
         warnings=_warnings(fit, checks, robust=robust) + changed,
     )  # fmt: skip
 
@@ -342,7 +343,14 @@ def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) ->
     law, values, parameters = fit.problem.law, fit.problem.values(fit.vector), list[EstimatedParameter]()
     moves = _moves(fit)
     sds = np.sqrt(np.diag(spread.covariance(robust=robust)))
-    acts = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair, "a": fit.problem.eddy}
+    acts = {
+        "sigma": law.saturation,
+        "L_rise": law.rise,
+        "i_knee": law.rise,
+        "i0": law.pair,
+        "a": fit.problem.eddy,
+        "tau": fit.problem.drift,
+    }
     acts |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
     drop = values["v_drop"] != 0.0 or any(n.name == "v_drop" and n.estimated for n in fit.problem.numbers)
     acts |= dict.fromkeys(("v_drop", "i_drop"), drop)
@@ -378,7 +386,7 @@ def _moves(fit: BearingFit) -> dict[str, float]:
     voltage = float(np.sqrt(np.mean(np.concatenate([r.u for r in moving]) ** 2)))
     known = {n.name for n in problem.numbers if n.signed} | {"L_leak", "L_rise", "i_knee"}
     found = {n: float(np.max(np.abs(x[1:] / table[0, 1:]))) for n, x in by.items() if n in known}
-    return {**found, "v_offset": 1.0 / voltage, "v_drop": 1.0 / voltage}
+    return {**found, "v_offset": 1.0 / voltage, "v_drop": 1.0 / voltage, "tau": 0.0}
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:

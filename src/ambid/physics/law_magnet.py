@@ -40,6 +40,7 @@ BEARING_NUMBERS: tuple[ParameterSpec, ...] = (
     ParameterSpec(name="v_offset", unit="V", meaning="voltage in addition to the logged one"),
     ParameterSpec(name="v_drop", unit="V", meaning="voltage drop of the power stage, against the current"),
     ParameterSpec(name="i_drop", unit="A", meaning="current over which that drop changes its sign", positive=True),
+    ParameterSpec(name="tau", unit="s", meaning="time constant in which a drifting force is forgotten", positive=True),
 )  # fmt: skip
 """Every number that a rig may give of a nonlinear magnet, beside m, R and c."""
 

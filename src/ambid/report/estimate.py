@@ -213,7 +213,7 @@ def header(estimate: AnyEstimate) -> list[Part]:
     if isinstance(e, Estimate):
         return [Lines(lines=[title_line(RecordEntry.of(e.record), f"model {e.model}", e.status)], wrap=False)]
     names = list(e.noise)
-    law = ", ".join([str(e.law), *(["eddy pole"] * e.eddy), *(["drift"] * e.drift)])
+    law = ", ".join([str(e.law), *(["eddy pole"] * e.eddy), *(["drift"] * (e.drift and not e.extended))])
     first = [(names_words(names), "strong"), f": {law}, {_seconds(e):.4g} s", *status_words(e.status)]
     groups = list[Line]()
     for words, at_rest in (("moving", False), ("held", True)):
@@ -287,11 +287,12 @@ def _cells(curve: Curve, inside: NDArray[np.bool_]) -> tuple[list[str], str]:
 
 def delay_lines(estimate: AnyEstimate) -> list[str]:
     """Say by how much each input is delayed; of a bearing the voltage, at each sampling rate."""
+    more = [f"model extended by: {', '.join(estimate.extended)}"] if estimate.extended else []
     if isinstance(estimate, Estimate):
         rate = RecordEntry.of(estimate.record).rate_hz
-        more = [f"model extended by: {', '.join(estimate.extended)}"] if estimate.extended else []
         return [delay_line(role, d, rate) for role, d in estimate.delay.items()] + more
-    return [delay_line(f"voltage at {rate}", d, float(rate.removesuffix(" Hz"))) for rate, d in estimate.delay.items()]
+    delays = [(f"voltage at {rate}", d, float(rate.removesuffix(" Hz"))) for rate, d in estimate.delay.items()]
+    return [delay_line(*d) for d in delays] + more
 
 
 def output_table(estimate: AnyEstimate) -> Table:

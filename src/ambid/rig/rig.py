@@ -159,7 +159,7 @@ class RigMagnet:
     rise : bool or None
         Whether the leakage inductance may rise with the current; None: the records decide.
     eddy, drift : bool
-        Whether the force has a pole a/(s + a), and whether a slowly walking force takes up what the law leaves over.
+        Whether the force has a pole a/(s + a), and whether a force and a voltage drift beside the law.
     off_below : float or None
         Voltage in V at or below which the power stage is off, so that the coil's voltage is not known.
     cone : float

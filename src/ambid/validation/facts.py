@@ -30,6 +30,7 @@ _FAR = 2.0  # standard deviations between R and the means, whose offsets are all
 _FURTHER = 4.0  # and below zero, from which the means alone contradict a coil
 _OFFSET = 0.005  # of a channel's largest value: its offset (sd), where the rig says nothing
 _ONE_SIDED = 0.02  # part of a current's largest value that may lie beyond zero
+_STAGE = 0.1  # of the mean voltage that a power stage may drop or add
 _SHARP, _OFFSETS = 0.02, 0.5  # R known so well (sd over R) and so far from the means is not of the same mean current
 _BLOCKS = 30  # stretches whose means show the scatter of a mean
 _PAST, _LAGS = 20, 40  # samples that whiten a signal, and between which two are compared
@@ -236,9 +237,12 @@ def _left(y: Array, rows: Array) -> float:
     return float(rest @ rest)
 
 
-def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1) -> Check:
+def ohm(
+    record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1, offset: bool = False
+) -> Check:
     """Compare R with the means of a record, `mean` and its sd, ohm; one `of` several records: chance lets the farthest
-    of all pass as often as a single one.
+    of all pass as often as a single one. `offset`: one of the voltage was estimated beside R; of a stage's size it
+    explains the difference, `size`, which the intervals of both then have to hold.
     """
     far = (R - mean) / float(np.hypot(sd, mean_sd))
     within = 2.0 * NormalDist().cdf(_FAR) - 1.0
@@ -247,6 +251,12 @@ def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of:
     detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
     if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS and mean > -_FURTHER * mean_sd:
         passed, detail = True, f"{detail}: the means are those of offsets"
+    apart = not passed
+    if apart and offset and abs(mean / R - 1.0) < _STAGE:
+        passed, detail = (
+            True,
+            f"{detail}: the offset of the voltage explains the difference, and both intervals hold it",
+        )
     if not passed:
         detail += (
             f": {abs(far):.2g} sd apart. An offset of {(mean - R) * i0:+.2g} V or {i0 * (1.0 - mean / R):+.2g} A, or a "
@@ -255,7 +265,7 @@ def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of:
     return Check(
         passed=passed, detail=detail,
         values={"value": mean, "sd": mean_sd, "apart_sd": far, "current_offset": i0 * (1.0 - mean / R)},
-        cause="" if passed else "ohm", size=None if passed else mean - R,
+        cause="" if passed else "ohm", size=mean - R if apart else None,
     )  # fmt: skip
 
 

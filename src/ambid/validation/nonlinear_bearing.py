@@ -24,7 +24,7 @@ from ambid.validation.second_record import conclude, consistency_check
 
 _ROLES = ("position", "current")
 _STAGE = ("v_offset", "v_drop", "i_offset")  # numbers that move the means of voltage and current
-_NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
+_NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0, "tau": 1e9}  # of a number that does not act; 0 for the others
 _LAGS = (1, 2, 3, 5, 8, 13)
 _INPUT_LAGS = (1, 2, 3, 4, 6, 9, 14, 21)
 _STRIDES, _REFIT, _LEAST = (2, 4), 30, 500  # of samples, iterations of a refit, and samples of half a record
@@ -269,7 +269,7 @@ def record_facts(
         means = checks.pop("ohm").values
         if means and not explained and not np.any(record.loose > 0.0):
             R, sd_R = values["R"], sd.get("R", 0.0)
-            checks["ohm"] = ohm(bench, R, sd_R, means["value"], means["sd"], of=len(names))
+            checks["ohm"] = ohm(bench, R, sd_R, means["value"], means["sd"], of=len(names), offset="v_offset" in sd)
             shift = checks["ohm"].size or 0.0
             by = {"R": shift, "v_offset": -shift * float(bench["current"].values.mean())}
             moves += [[by.get(n, 0.0) for n in spread.names]] * (shift != 0.0)

@@ -48,8 +48,9 @@ def as_seen(done: Simulation, name: str = "record") -> BearingRecord:
 
 def truth_of(bench: Preset) -> dict[str, float]:
     plant = bench.plant
-    rest = {"sigma": 0.0, "L_rise": 0.0, "i_knee": 1.0, "c": plant.c, "g": plant.gravity, "a": 500.0, "x_offset": 0.0,
-            "i_offset": 0.0, "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02, "m": plant.m, "R": plant.R}  # fmt: skip
+    rest = {"sigma": 0.0, "L_rise": 0.0, "i_knee": 1.0, "c": plant.c, "g": plant.gravity, "a": 500.0, "tau": 3e-3,
+            "x_offset": 0.0, "i_offset": 0.0, "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02, "m": plant.m,
+            "R": plant.R}  # fmt: skip
     return {**rest, **law_numbers(plant.magnet.coenergy)}
 
 

@@ -9,10 +9,10 @@ from ambid.bearing.magnet_problem import BearingRecord
 K, LEAK, MASS, RESISTANCE, RATE, STEPS = 3.9e-6, 3e-3, 0.05, 3.0, 5000.0, 4
 GAP = 0.2e-3  # at position 0
 STOPS = (0.8e-3, 2.8e-3)
-NOISE = [1e-6, 1e-3, 3e-3, 0.01, 0.01]  # position, current, force, voltage, drift: rms of one sample
+NOISE = [1e-6, 1e-3, 3e-3, 0.01, 0.01, 0.01]  # in the order of `LEVELS`: rms of one sample
 TRUTH = {"k": K, "s": GAP, "L_leak": LEAK, "m": MASS, "R": RESISTANCE, "g": 9.81, "c": 0.0, "a": 500.0, "sigma": 0.0,
          "L_rise": 0.0, "i_knee": 1.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0, "x_offset": 0.0, "i_offset": 0.0,
-         "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02}  # fmt: skip
+         "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02, "tau": 1.0}  # fmt: skip
 
 
 def _rates(x: float, v: float, i: float, volts: float, force: float) -> tuple[float, float, float]:
@@ -21,12 +21,16 @@ def _rates(x: float, v: float, i: float, volts: float, force: float) -> tuple[fl
 
 
 def ball_between_stops(
-    setpoint: np.ndarray, seed: int, *, bounce: float = 0.2, volts: float = 2.0, name: str = "ball.csv"
-) -> BearingRecord:
-    """A levitated ball whose set point may lie beyond a stop; voltage held over a sample, no delay."""
+    setpoint: np.ndarray, seed: int, *, bounce: float = 0.2, volts: float = 2.0, name: str = "ball.csv",
+    beside: np.ndarray | None = None,
+) -> BearingRecord:  # fmt: skip
+    """A levitated ball whose set point may lie beyond a stop; voltage held over a sample, no delay. `beside`: voltage
+    and force that nobody logs, (n, 2).
+    """
     rng, n, h = np.random.default_rng(seed), setpoint.size, 1.0 / RATE / STEPS
     kick = np.repeat(rng.choice([-volts, volts], n // 7 + 1), 7)[:n]
     noise = rng.standard_normal((n, 4)) * NOISE[:4]
+    noise[:, [3, 2]] += 0.0 if beside is None else beside
     y, u = np.zeros((n, 2)), np.zeros(n)
     x, v, before, slow = float(setpoint[0]) + GAP, 0.0, 0.0, 0.0
     i = x * math.sqrt(2.0 * MASS * 9.81 / K)

@@ -10,7 +10,7 @@ from ambid.bearing.magnet_problem import BearingRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from tests.bearing.magnet.bearings import as_seen, problem_of, unstable
 
-NOISE = [1e-7, 2e-3, 1.0, 0.05, 0.02]
+NOISE = [1e-7, 2e-3, 1.0, 0.05, 0.02, 0.01]
 PAIR = {"k", "s", "L_leak", "i0", "m", "R", "c", "x_offset", "i_offset", "v_offset", "g"}
 
 
@@ -56,10 +56,10 @@ def test_sensitivities_of_mean_and_covariance_are_exact(bench, kind):
         settings = {"free_delay": frozenset([record.rate_hz])}
         record = replace(record, knock=np.where(np.arange(400) // 20 == 5, 3.0, 0.0))
     if kind == "drift":
-        settings, estimated = {"drift": True}, {"k", "s", "m", "R", "c"}
+        settings, estimated = {"drift": True}, {"k", "s", "m", "R", "c", "tau"}
     if kind == "eddy":
         truth["a"] = 3e4
-        settings, estimated = {"eddy": True, "drift": True}, {"a", "k", "s", "m", "c"}
+        settings, estimated = {"eddy": True, "drift": True}, {"a", "k", "s", "m", "c", "tau"}
     if kind == "delay":
         settings, estimated = {"free_delay": frozenset([record.rate_hz])}, {"k", "L_leak"}
     problem = problem_of([record], truth, law, estimated, NOISE, 0.6 if kind in ("delay", "stage") else 1.0, **settings)
@@ -85,7 +85,7 @@ def test_sensitivities_of_one_magnet_with_an_exponential_gap():
     rng, n = np.random.default_rng(2), 300
     truth = {"L_g": 0.04, "zeta": 6.3e-3, "sigma": 0.1, "L_leak": 0.05, "L_rise": 0.06, "i_knee": 0.28, "i0": 0.0,
              "m": 0.06, "R": 4.2, "c": 0.1, "g": 9.81, "a": 900.0, "x_offset": 0.0, "i_offset": 0.0,
-             "v_offset": 0.1, "v_drop": 0.3, "i_drop": 0.6, "k_asym": 0.0, "i0_asym": 0.0}  # fmt: skip
+             "v_offset": 0.1, "v_drop": 0.3, "i_drop": 0.6, "tau": 1.0, "k_asym": 0.0, "i0_asym": 0.0}  # fmt: skip
     x = 10e-3 + 1e-3 * np.sin(np.arange(n) / 30) + 2e-5 * rng.standard_normal(n)
     i = 0.96 + 0.1 * np.cos(np.arange(n) / 30) + 5e-3 * rng.standard_normal(n)
     valid = np.ones((n, 2), dtype=bool)
@@ -113,7 +113,7 @@ def test_sensitivities_of_one_magnet_with_an_exponential_gap():
         "i_drop",
     }
     problem = problem_of(
-        [moving, held], truth, law, estimated, [2e-5, 5e-3, 0.05, 0.1, 0.01], 1.45,
+        [moving, held], truth, law, estimated, [2e-5, 5e-3, 0.05, 0.1, 0.01, 0.01], 1.45,
         eddy=True, free_delay=frozenset([1000.0, 200.0]),
     )  # fmt: skip
     gradient_agrees(problem, problem.start())

@@ -24,7 +24,7 @@ KNOWN = {
 STRONG = Motion(swing=0.30, swing_hz=2.0, volts=12.0, hold=3)
 WEAK_MOTION = Motion(swing=0.01, swing_hz=5.0, volts=1.0, hold=10)
 EQUAL, UNEQUAL = MagnetLaw(pair=True), MagnetLaw(pair=True, asymmetric=True)
-NOISE = [1e-7, 2e-3, 1.0, 0.05, 0.02]
+NOISE = [1e-7, 2e-3, 1.0, 0.05, 0.02, 0.01]
 BARS = {"k": 0.01, "s": 0.005, "m": 0.01, "R": 0.01, "L_leak": 0.1}
 
 
