@@ -466,8 +466,8 @@ def predict(
     current, and whether measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or
     twice the square of a level; without lanes the criterion alone. `noise2`: squared levels of position, current,
     force, voltage and their drifts (of one sample). `z`, `P`, `X` (`ROOM`,; zero at first), state, covariance and
-    derivatives before `first`, move along; `e`, `s` (n, 2) get innovations and variances, `rows` (4 (end - first), p + 1) the
-    likelihood's.
+    derivatives before `first`, move along; `e`, `s` (n, 2) get innovations and variances, `rows` (4 (end - first),
+    p + 1) the likelihood's.
     """
     n = len(states)
     p = min((active.size + 7) // 8 * 8, PITCH)  # a few stay empty, so that vector instructions leave none over
