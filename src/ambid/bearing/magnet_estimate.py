@@ -63,11 +63,11 @@ def estimate_bearing(
     seed: int = 0,
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several `records`, at least one of a free rotor. `laws`: the likelihood
-    chooses; `extend`: parts that they may take on (BIC), saturation only with residuals that are `white`, or it would
-    take up any misfit; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force behind a pole
-    a/(s + a); `drift`: a force that is forgotten in `tau` and a voltage
-    that walks, both driven by noise, for sure, not only where they pay; `seed`: of the global search, told by the
-    fit's `global_search`; a KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
+    chooses; `extend`: parts that they may take on (BIC), saturation and drift only with residuals that are `white`, or
+    they would take up any misfit; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force
+    behind a pole a/(s + a); `drift`: a force that is forgotten in `tau` and a voltage that walks, both driven by noise,
+    for sure, not only where they pay; `seed`: of the global search, told by the fit's `global_search`; a
+    KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
     """
     free = [r for r in records if not r.held]
     if not free:
@@ -94,7 +94,8 @@ def estimate_bearing(
             fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
             near = _CLOSE if fit.status == "converged" else _FAR
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
-        fit = _drifting(fit, parameters, again) if "drift" in extend else fit
+        if white is not None and "drift" in extend:
+            fit = _drifting(fit, short, parameters, white, again)
         if "saturation" in extend:
             richer = _extended(fit, "saturation", parameters, short, linear, again)
             same = richer.problem.law == fit.problem.law
@@ -207,18 +208,28 @@ def _extended(
     return richer if fit.criterion - richer.criterion > price else fit
 
 
-def _drifting(fit: BearingFit, parameters: Mapping[str, Parameter], tick: Tick | None) -> BearingFit:
-    """Return a fit with a force and a voltage that drift beside what it has, where that pays (BIC)."""
+def _drifting(
+    fit: BearingFit, short: Sequence[BearingRecord], parameters: Mapping[str, Parameter],
+    white: Callable[[BearingFit], bool], tick: Tick | None,
+) -> BearingFit:  # fmt: skip
+    """Return a fit with a force and a voltage that drift beside what it has, where that pays (BIC) and leaves white
+    residuals, on the `short` records already: it would take up any misfit.
+    """
     if fit.problem.drift or fit.status == "failed":
         return fit
     numbers = _acting(fit.problem.numbers, parameters, eddy=fit.problem.eddy, drift=True)
     problem = replace(fit.problem, drift=True, numbers=numbers)
     price = (problem.size - fit.problem.size) * float(np.log(problem.n_used))
-    at = linearise(problem, _carried(fit, problem))
+    begun = _carried(fit, problem)
+    at = linearise(problem, begun)
     if at is not None and promise(at) < _LIKELY * price:
         return fit
-    more = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
-    return more if fit.criterion - more.criterion > price else fit
+    tried = search(replace(problem, records=tuple(short)), begun, iterations=_TRIED, tick=tick)
+    if tried.status == "failed" or not white(tried):
+        return fit
+    more = search(problem, begun, iterations=_LONG, tick=tick)
+    pays = more.status == "converged" and fit.criterion - more.criterion > price
+    return more if pays and white(more) else fit
 
 
 def _saturates(fit: BearingFit) -> bool:

@@ -8,6 +8,7 @@ from ambid.bearing.magnet_likelihood import uncertainty
 from ambid.bearing.magnet_problem import FORGETS
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
+from ambid.validation.nonlinear_bearing import white
 from tests.bearing.magnet.stops import MASS, RATE, TRUTH, ball_between_stops
 
 TAU, N = 0.02, 5000  # s, samples
@@ -34,7 +35,7 @@ def ball(seed, force, voltage):
 
 
 def identified(record, **words):
-    fit = estimate_bearing([record], KNOWN, laws=[LAW], delay=0.0, **words)
+    fit = estimate_bearing([record], KNOWN, laws=[LAW], delay=0.0, white=white, **words)
     spread, values = uncertainty(fit), fit.problem.values(fit.vector)
     sd = np.sqrt(np.diag(spread.covariance(robust=False)))
     z = {n: (values[n] - TRUTH[n]) / s for n, s in zip(spread.names, sd, strict=True) if n != "tau"}
