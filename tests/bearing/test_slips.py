@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.columns import check_lag, lag_of, refuse_silent, without_lag
+from ambid.bearing.columns import check_lag, lag_of, refuse_mistaken, refuse_silent, without_lag
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
@@ -103,6 +103,12 @@ def test_a_rate_ten_times_wrong_is_named_where_a_mass_is_known():
     assert "the sampling rate is ten times what was said" in check.detail
 
 
+def test_an_inductance_within_a_sample_is_no_size():
+    values, seen = slipped("pump", "voltage", 1.0)
+    assert check_units({**values, "L": 1e-12}, (), seen).passed
+    assert not check_units({**values, "L": 1e-12}, (), replace(seen, rate_hz=1e15)).passed
+
+
 COIL_SLIPS = [("voltage", 1e3), ("current", 1e3), ("voltage", 1e-3), ("current", 1e6)]
 
 
@@ -129,6 +135,21 @@ def test_the_rotor_alone_has_its_units_checked(channel, factor):
 
 
 RMIT_SEEN = Signals(u=np.array([[1.0], [-1.0]]), y=np.array([[2e-4], [0.0]]), rate_hz=1e4)
+
+
+@pytest.mark.parametrize("resistance", [0.8, 80.0])
+def test_columns_are_not_called_swapped_against_their_means(resistance):
+    """The fit after the change has 0.8 ohm: the changed record's mean voltage over mean current has to say so."""
+    bench = run("bearing", 3000, 3)
+    fit = greybox(bench.model, bench.signals, parameters(bench))
+    swapped = bench.signals.y[:, ::-1] + np.array([1.0, 100.0 / resistance])
+    signals = replace(bench.signals, u=bench.signals.u + 100.0, y=swapped)
+    asked = (bench.model, signals, parameters(bench), 0.0, np.inf, lambda _: fit)
+    if resistance < 1.0:
+        with pytest.raises(EstimationError, match="are swapped"):
+            refuse_mistaken(*asked)
+    else:
+        refuse_mistaken(*asked)
 
 
 def test_a_coils_sign_and_order_are_named():

@@ -43,6 +43,7 @@ _GAIN = 0.7  # fall of the criterion per sample by which a change of the record 
 
 _STRETCH = 4096  # samples that show a coil
 _CLEAR = 0.9  # part that a coil has to explain before its signs are believed
+_OFFSETS = 0.5  # relative, that offsets may put between R and mean voltage over mean current
 _FOLLOWED = 2  # changes that are searched from, the best first
 
 
@@ -145,31 +146,45 @@ def refuse_mistaken(
         return
     below = as_is - (0.0 if searched else _GAIN)
     _refuse_units(model, signals, parameters, delay, follow, np.inf if searched else below)
-    better: list[tuple[float, str, str, list[Candidate]]] = []
+    better: list[tuple[float, str, str, Signals, list[Candidate]]] = []
     likely, others = _likely(model, _changes(model, signals), 0.0 if coil is None or turned else coil.share)
     for text, remedy, changed in likely:  # one start and one search, where a coil shows what is wrong
-        _refuse_explained(text, remedy, _starts(model, changed, parameters, delay), follow)
+        _refuse_explained(text, remedy, changed, _starts(model, changed, parameters, delay), follow)
     if model.name == "one-axis":  # after them: two columns that are swapped look like one that lags by a lot
         _refuse_late(model, signals, parameters, delay, follow)
     for text, remedy, changed in others:
         candidates = _starts(model, changed, parameters, delay)
         per_sample = candidates[0].criterion / candidates[0].problem.n_used if candidates else np.inf
         if per_sample < below:
-            better.append((per_sample, text, remedy, candidates))
-    for _, text, remedy, candidates in sorted(better, key=lambda b: b[0])[:_FOLLOWED]:
-        _refuse_explained(text, remedy, candidates, follow)
+            better.append((per_sample, text, remedy, changed, candidates))
+    for _, text, remedy, changed, candidates in sorted(better, key=lambda b: b[0])[:_FOLLOWED]:
+        _refuse_explained(text, remedy, changed, candidates, follow)
 
 
 def _refuse_explained(
-    text: str, remedy: str, candidates: Sequence[Candidate], follow: Callable[[Sequence[Candidate]], Fit]
+    text: str,
+    remedy: str,
+    changed: Signals,
+    candidates: Sequence[Candidate],
+    follow: Callable[[Sequence[Candidate]], Fit],
 ) -> None:
-    """Raise where a changed record, of which these are the start values, is explained."""
+    """Raise where a changed record, of which these are the start values, is explained, its means too."""
     fit = _try(follow, candidates) if candidates else None
-    if fit is not None and _can_be(fit):
+    if fit is not None and _can_be(fit) and not _means_contradict(fit, changed):
         raise EstimationError(
             f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
             f"{remedy}"
         )
+
+
+def _means_contradict(fit: Fit, signals: Signals) -> bool:
+    """Return whether mean voltage over mean current of a record is far from R, where both keep to one side."""
+    model, theta = fit.problem.model, fit.problem.parameters(fit.vector)
+    columns = dict(zip((*model.inputs, *model.outputs), [*signals.u.T, *signals.y.T], strict=True))
+    if "R" not in theta or not {"voltage", "current"} <= columns.keys():
+        return False
+    (v, v_sd), (i, i_sd) = ((float(x.mean()), float(x.std())) for x in (columns["voltage"], columns["current"]))
+    return abs(v) > v_sd and abs(i) > i_sd and abs(v / (i * theta["R"]) - 1.0) > _OFFSETS
 
 
 def _coil(model: LinearModel, signals: Signals) -> Coil | None:

@@ -116,6 +116,8 @@ def check_units(
     `signals` are those of a bench, else name the slip of a unit; `plant`: default one-axis.
     """
     plant = model("one-axis") if plant is None else plant
+    if values.get("L", np.inf) * signals.rate_hz < values.get("R", 0.0):  # within a sample L is not seen
+        values = {name: value for name, value in values.items() if name != "L"}
     sizes, largest = [*SIZES, *_said(parameters)], _seen(signals, plant)
     logs = np.array([_log(size, {**values, **largest}) for size in sizes])
     low, high = (np.log10([size.usual[j] for size in sizes]) for j in (0, 1))
