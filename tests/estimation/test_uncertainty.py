@@ -104,6 +104,16 @@ def test_without_motional_voltage_only_ratios_to_the_mass_are_seen():
     assert experiment_hint(fixed, {**bench.truth}, 2.0, robust=False) is None
 
 
+def test_an_inductance_beyond_half_the_rate_asks_for_a_faster_one():
+    known = uncertainty(search(*problem_of(run("coil", 2000, 3), estimated=("R", "L"))))
+    unseen = replace(known, bias=np.array([0.0, 1.0]))
+    truth = dict(run("coil", 2000, 3).truth)
+    for L, advice in ((truth["L"], "for L, excite at"), (1e-9, "for L, sample faster")):
+        assert advice in str(experiment_hint(unseen, {**truth, "L": L}, (1.0, 1.0, 5000.0), robust=True)).replace(
+            "For", "for"
+        )
+
+
 def test_a_prior_on_the_mass_is_what_the_rotor_then_knows():
     bench = run("falling rotor", 3000, 2)
     problem, vector = problem_of(bench, estimated=("m", "k_x", "k_i"))

@@ -62,3 +62,25 @@ def test_what_is_hardly_moved_is_left_out(record):
     (line,) = calibration_lines(ambid.identify(record, rig))
     assert " m" not in line.partition("moves: ")[2]
     assert "+0 %" not in line
+
+
+def test_what_no_record_shows_is_left_out(record):
+    """Of an inductance near zero the linear move is millions of per cent."""
+    estimate = ambid.identify(record)
+    far = replace(estimate, calibration={"voltage": {"R": 1.0, "L": -1.5e6}})
+    assert "voltage R +1 %." in " ".join(calibration_lines(far))
+
+
+def test_of_a_coil_alone_no_mass_is_to_be_weighed():
+    record = ambid.simulate("thesis", duration=0.3, seed=2)
+    columns = {name: record[name].values for name in ("voltage", "current")}
+    rig = {
+        "schema": "ambid.rig/1",
+        "model": "coil",
+        "channels": {name: {"column": name} for name in columns},
+    }
+    (line,) = calibration_lines(
+        ambid.identify(columns, rig, rate_hz=record.rate_hz, units={"voltage": "V", "current": "A"})
+    )
+    assert "1 % of gain moves" in line
+    assert "weigh" not in line

@@ -122,6 +122,8 @@ def test_physics_forbids_what_it_forbids():
         wrong = implausible(of, {**BEARING, name: -0.1}, sd)
         assert len(wrong) == 1
         assert wrong[0].startswith(f"{name} = -0.1")
+    assert "impossible" in implausible(of, {**BEARING, "L": 1e-9}, {**sd, "L": 1e-10})[0]
+    assert implausible(of, {**BEARING, "L": 1e-9}, sd) == []  # which the record does not show
     assert implausible(of, {**BEARING, "c": -0.02}, sd) == []  # within 3.3 sd of none
     assert "generate energy" in implausible(of, {**BEARING, "c": -0.05}, sd)[0]
     # a spring may have either sign, and so may the force

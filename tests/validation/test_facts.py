@@ -128,6 +128,19 @@ def test_belonging_is_seldom_denied_and_never_where_the_force_shows():
     assert agreements(mixed, default_rig(), THETA, SD, SD)["belonging"].passed
 
 
+def test_a_coil_that_the_fit_shows_relates_its_current_and_voltage():
+    """In a short log whose noise hides both from each other; a position of another run stays alone."""
+    own, rng = carried(1, 500), np.random.default_rng(1)
+    v, i = (own[name].values + rng.standard_normal(500) for name in ("voltage", "current"))
+    noisy = record(v, i, carried(2, 500)["position"].values)
+    theta, unsure = {**THETA, "L": 0.04}, {**SD, "k_i": 1.0, "L": 0.1}
+    assert "relates the position" not in belonging(noisy).detail
+    assert not agreements(noisy, default_rig(), theta, unsure, SD)["belonging"].passed
+    told = agreements(noisy, default_rig(), theta, {**unsure, "L": 1e-3}, SD)["belonging"]
+    assert not told.passed
+    assert "relates the position to" in told.detail
+
+
 def test_slow_signals_of_two_runs_are_related_by_chance_only():
     """Random walks always look alike; whitened, at most a few of a hundred pairs do."""
     rng = np.random.default_rng(5)
@@ -142,6 +155,13 @@ def test_slow_signals_of_two_runs_are_related_by_chance_only():
 def test_a_coil_faster_than_the_sampling_is_named(inductance, cause, grave):
     check = agreements(carried(), default_rig(), {**THETA, "L": inductance}, {**SD, "L": 1e-5}, SD)["sampling"]
     assert (check.cause, check.grave) == (cause, grave)
+
+
+def test_of_an_inductance_that_is_not_seen_a_bound_is_told():
+    check = agreements(carried(), default_rig(), {**THETA, "L": 1e-14}, {**SD, "L": 1e-6}, SD)["sampling"]
+    assert check.grave
+    assert "less than 0.1 samples" in check.detail
+    assert "50000 Hz" in check.detail
 
 
 def test_voltage_that_changes_between_samples_is_seen():

@@ -242,7 +242,10 @@ def experiment_hint(
             "the rotor and fix m (or give a prior), or excite faster and larger motion"
         )
     frequencies = _frequencies(values, band_hz)
-    advice = [_ADVICE[name].format(**frequencies) for name in unseen if name in _ADVICE]
+    texts = dict(_ADVICE)
+    if values.get("R", 0.0) > 2.0 * np.pi * band_hz[-1] * values.get("L", np.inf):  # beyond what a record can hold
+        texts["L"] = "for L, sample faster"
+    advice = [texts[name].format(**frequencies) for name in unseen if name in texts]
     worst = float(max(u.relative_sd(robust=robust)))
     factor = worst / WEAK
     more = (

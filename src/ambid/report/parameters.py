@@ -210,7 +210,7 @@ def pole_table(
     return [grid(rows)] if poles else []
 
 
-_FELT = 0.05  # per cent
+_FELT, _LINEAR = 0.05, 100.0  # per cent: less is not shown, and more is of a number that the record does not show
 
 
 def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
@@ -233,7 +233,9 @@ def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
     first = "Some of the calibration is in no interval. " if stated else "Intervals are from this record alone. "
     lines = list[str]()
     if words:
-        unweighed = not any(p.role != "free" and p.value for p in e.parameters)
+        unweighed = not any(p.role != "free" and p.value for p in e.parameters) and any(
+            p.name == "m" for p in e.parameters
+        )
         weigh = ", or weigh one thing: with m fixed, a wrong factor or clock shows" if unweighed else ""
         lines.append(f"{first}1 % of gain moves: {'; '.join(words)}. Give gain_sd and rate_sd in the rig{weigh}")
     if planes:
@@ -254,7 +256,7 @@ def _grouped(moves: Mapping[str, float]) -> str:
     groups, short = dict[str, dict[str, None]](), {name: name.rpartition(".")[2] for name in moves}
     for name, x in moves.items():
         by, alike = _per_cent(x), {_per_cent(y) for other, y in moves.items() if short[other] == short[name]}
-        if abs(x) >= _FELT:
+        if _FELT <= abs(x) <= _LINEAR:
             groups.setdefault(by, {})[short[name] if len(alike) == 1 else name] = None
     return ", ".join(f"{', '.join(names)} {by}" for by, names in groups.items())
 

@@ -36,7 +36,7 @@ _BLOCKS = 30  # stretches whose means show the scatter of a mean
 _PAST, _LAGS = 20, 40  # samples that whiten a signal, and between which two are compared
 _LONGEST = 40_000  # samples that are compared
 _CHANCE = 1e-3  # probability above which a relation may be chance
-_SHOWN = 3.0  # standard deviations of k_i above which current and position belong together
+_SHOWN = 3.0  # standard deviations of k_i above which current and position belong together, of L current and voltage
 _STILL = 4  # samples in which no channel changes: the log stood still
 GRAVITY = 9.81  # m/s^2
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
@@ -76,9 +76,9 @@ def offset_sd(record: Record, role: str, rig: Rig | None) -> float:
     return _OFFSET * float(np.abs(record[role].values).max()) if said is None else said
 
 
-def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> dict[str, Check]:
+def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False, coil: bool = False) -> dict[str, Check]:
     """Return what the record says by itself, channels named by role; a check that fails names a cause. `rig`: for the
-    offsets of its channels; `belongs`: whether position and current are known to.
+    offsets of its channels; `belongs`, `coil`: whether all channels, or current and voltage, are known to.
     """
     roles = set(record.names)
     checks: dict[str, Check] = {}
@@ -86,7 +86,7 @@ def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> d
         checks["ohm"] = means_check(record, rig)
     if {"position", "current"} <= roles:
         known_pair = Check(passed=True, detail="position and current are of one run: the force shows")
-        checks["belonging"] = known_pair if belongs else belonging(record)
+        checks["belonging"] = known_pair if belongs else belonging(record, coil=coil)
         checks["weight"] = _weight(record["current"].values)
     if "position" in roles:
         checks["position_size"] = _position_size(record["position"].values)
@@ -112,13 +112,16 @@ def _ohms(value: float, sd: float) -> str:
     return f"mean voltage over mean current is {value:.4g} ± {sd:.2g} ohm, if neither has a larger offset"
 
 
-def belonging(record: Record) -> Check:
-    """Check that each of position, current and voltage is related to another of them beyond chance."""
+def belonging(record: Record, *, coil: bool = False) -> Check:
+    """Check that each of position, current and voltage is related to another of them beyond chance; of the latter two
+    it may be known that one `coil` has both.
+    """
     names = [name for name in ("position", "current", "voltage") if name in record.names]
     chance = dict.fromkeys(names, 0.0)
     if record.n_samples >= 4 * (_PAST + _LAGS):
         white = {name: _whitened(record[name].values[:_LONGEST]) for name in names}
         pairs = {pair: _chance(*(white[name] for name in pair)) for pair in combinations(names, 2)}
+        pairs |= {("current", "voltage"): 0.0} if coil else {}
         chance = {name: min(p for pair, p in pairs.items() if name in pair) for name in names}
     alone = max(names, key=lambda name: chance[name])
     passed = chance[alone] <= _CHANCE
@@ -201,8 +204,8 @@ def agreements(
     `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model. The weight has a
     check of its own, `ambid.validation.physical.gravity_balance`.
     """
-    force = abs(theta["k_i"]) > _SHOWN * sd.get("k_i", np.inf) and rig.parameter("k_i").role == "free"
-    checks = {name: c for name, c in facts(record, rig, belongs=force).items() if name != "weight"}
+    force, coil = (abs(theta[n]) > _SHOWN * sd.get(n, np.inf) and rig.parameter(n).role == "free" for n in ("k_i", "L"))
+    checks = {name: c for name, c in facts(record, rig, belongs=force, coil=coil).items() if name != "weight"}
     means = checks["ohm"].values
     if means:  # less what the flux took up from the first sample to the last
         i, x = record["current"].values, record["position"].values
@@ -274,14 +277,15 @@ def sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: float
     R, L = theta["R"], theta["L"]
     if "L" not in sd:
         return Check(passed=True, detail="the inductance is given")
+    seen = L / R * rate_hz if R > 0 else np.nan
     samples = (L + 2.0 * sd["L"]) / R * rate_hz if R > 0 else np.inf
-    passed = samples >= _PER_COIL
+    passed, low = samples >= _PER_COIL, max(samples, 0.1)
+    size = f"is {seen:.2g}" if 2.0 * sd["L"] < L else f"is less than {low:.2g}"
     return Check(
-        passed=passed, values={"samples": L / R * rate_hz if R > 0 else np.nan}, grave=samples < 1.0,
-        cause="" if passed else "sampling",
-        detail=f"the coil's time constant is {L / R * rate_hz:.3g} samples long" if passed
-        else f"sampled too slowly for the coil: L/R is {max(L / R * rate_hz, 0.0):.2g} samples, so that L is not seen. "
-        f"Sample at {rate_hz * 5.0 / max(samples, 0.1):.2g} Hz or more, or fix L",
+        passed=passed, values={"samples": seen}, grave=samples < 1.0, cause="" if passed else "sampling",
+        detail=f"the coil's time constant is {seen:.3g} samples long" if passed
+        else f"sampled too slowly for the coil: L/R {size} samples, so that L is not seen. Sample at "
+        f"{float(f'{rate_hz * 5.0 / low:.2g}'):.0f} Hz or more, or fix L",
     )  # fmt: skip
 
 

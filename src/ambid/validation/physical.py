@@ -58,6 +58,7 @@ _SAME = 1e-6  # length left of a column below which it counts as held by the oth
 _STRIDES = (2, 4)
 _MOST = 4.0  # shift in its standard deviations that chance allows
 _BEYOND = 10.0  # from which no number is to be used
+_LOST = 100.0  # standard deviation over value from which its size says nothing
 _FAR = 3.3  # standard deviations between a prior and the record
 _MISSED = 0.05  # part of a sample in which a delay may go unseen and move a parameter out of its interval
 _SIZES = {"m": (1e-5, 1e5), "k_x": (0.0, 1e11), "k_i": (0.0, 1e6), "R": (1e-4, 1e5), "L": (1e-7, 1e3), "c": (0.0, 1e8)}
@@ -359,7 +360,7 @@ def physical_checks(fit: Fit, spread: Uncertainty, record: Record, *, robust: bo
 def _identifiable(fit: Fit, spread: Uncertainty, theta: Mapping[str, float], *, robust: bool) -> Check:
     visible = spread.identifiable_at(robust=robust)
     unseen = [
-        f"{name} (sd {100 * r:.0f} %)"
+        f"{name} (sd {100 * r:.0f} %)" if r < _LOST else f"{name} (sd beyond {100 * _LOST:.0f} %)"
         for name, ok, r in zip(spread.names, visible, spread.relative_sd(robust=robust), strict=True)
         if not ok
     ]
@@ -385,8 +386,8 @@ def lowest_power_hz(u: Array, rate_hz: float) -> float:
 
 def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
     """List what physics forbids in `values` with `sd`, SI, one line each: mass, resistance and inductance not positive
-    (a coil with R > 0 and L > 0 is passive), damping negative beyond its uncertainty, sizes outside what is built, from
-    micro-bearings to turbines (a slip of units).
+    (a coil with R > 0 and L > 0 is passive), beyond its uncertainty damping negative, and sizes outside what is built,
+    from micro-bearings to turbines (a slip of units).
     """
     texts = []
     for spec in model.parameters:
@@ -394,7 +395,7 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
         if spec.positive and value <= 0:
             texts.append(f"{spec.name} = {value:.4g} {spec.unit} ({spec.meaning}) must be positive")
         low, high = _SIZES.get(spec.name, (0.0, float("inf")))
-        if not low <= abs(value) <= high:
+        if not low - 2.0 * spread <= abs(value) <= high + 2.0 * spread:
             texts.append(
                 f"{spec.name} = {value:.4g} {spec.unit} is impossible for a bearing: check the units and calibration "
                 "of the columns and the sampling rate"
@@ -553,7 +554,10 @@ def gravity_balance(
             "with more excitation"
         )
     if not passed and magnet == RigMagnet():
-        detail += ". If a pair of magnets carries the rotor, or none of its weight, give magnet.kind = 'pair'"
+        detail += (
+            ". If a pair of magnets or a permanent magnet carries the rotor, or none of its weight, give magnet.kind = "
+            "'pair'"
+        )
     values = {
         "current_offset": i0 * off / (1.0 + off),
         "k_i_over_m": ratio,
