@@ -7,10 +7,12 @@ import pytest
 
 import ambid
 from ambid.bearing.linear import greybox
+from ambid.estimation.estimate import Check
 from ambid.job.data import load_bench, signals_of
 from ambid.physics.presets import preset
+from ambid.record import Channel, Record
 from ambid.rig import default_rig, rig_of_preset
-from ambid.validation.causes import causes, named_bias
+from ambid.validation.causes import Cause, causes, causes_check, named_bias
 from tests.tiers import runs
 
 
@@ -225,3 +227,34 @@ def test_a_line_whose_channel_is_not_clear_is_held_by_force_and_voltage():
     assert estimate.verdict.word == "usable"
     for name in ("m", "k_x", "k_i", "R", "L"):
         assert estimate[name].value == pytest.approx(clean[name].value, abs=2.0 * estimate[name].sd)
+
+
+def cause(name, gain, **more):
+    return Cause(name=name, gain=gain, p=0.0, size=19.0, shift=np.full(1, 9.0), sizes=np.ones(1), **more)
+
+
+@pytest.mark.parametrize(
+    ("far", "every", "named", "also"),
+    [
+        (False, 1, "fixed_value", ("friction",)),
+        (True, 1, "friction", ("fixed_value",)),  # a mass that would have to be thousands of times itself
+        (False, 10, "sampling", ("fixed_value", "friction")),
+    ],
+)
+def test_a_weighed_value_is_blamed_where_it_can_be_what_is_wrong(far, every, named, also):
+    rng, n = np.random.default_rng(3), 20_000
+    v, i = rng.standard_normal(n), np.zeros(n)
+    for k in range(n - 1):
+        i[k + 1] = 0.95 * i[k] + 0.05 * v[k]
+    i += 1e-4 * rng.standard_normal(n)
+    columns = {"voltage": v, "current": i, "position": i**2}
+    channels = tuple(Channel(name=name, values=x[::every], unit="V", source_unit="V") for name, x in columns.items())
+    record = Record(channels=channels, rate_hz=1e3, start_s=0.0, provenance={}, history=())
+    failed = Check(passed=False, detail="", values={"gain": 250.0})
+    found = [cause("fixed_value", 250.0, channel="m", far=far), cause("friction", 180.0)]
+    check = causes_check(
+        found, {"estimates_agree": failed, "fixed_agree": failed}, np.ones(1), robust=True, record=record
+    )["causes"]
+    assert (check.cause, check.alternatives) == (named, also)
+    if named == "fixed_value":
+        assert "the fixed m fits better +19 (SI) from where it is" in check.detail
