@@ -190,6 +190,15 @@ def test_time_of_no_usual_rate_is_asked_back(tmp_path):
         read_record(tmp_path / "r.csv")
 
 
+def test_a_rate_at_the_edge_of_the_usual_ones_is_asked_whatever_its_last_digit(tmp_path):
+    for step in ("0.02", "0.0200001", "0.0199999"):
+        (tmp_path / "r.csv").write_text(
+            "t,u [V]\n" + "".join(f"{k * float(step)},{k % 3}\n" for k in range(50)), "utf-8"
+        )
+        with pytest.raises(RecordError, match=r"it may be in s \(.* or ms"):
+            read_record(tmp_path / "r.csv")
+
+
 def test_a_quote_without_end_is_refused_in_one_line(tmp_path):
     (tmp_path / "r.csv").write_text("time [s],u [V]\n" + '"' * 200_000, encoding="utf-8")
     with pytest.raises(RecordError, match="1 row"):

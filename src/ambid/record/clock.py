@@ -175,7 +175,7 @@ def _plausible(time: Array) -> list[str]:
         return ["s"]  # what is wrong with it is told where rates are checked
     rates = {unit: 1.0 / (period * scale) for unit, scale in _UNITS.items()}
     usual = [unit for unit, rate in rates.items() if _USUAL <= rate <= _FAST]
-    slow = [unit for unit, rate in rates.items() if _SLOW < rate < _USUAL]
+    slow = [unit for unit, rate in rates.items() if (1.0 - _EVEN) * _SLOW < rate < _USUAL]
     if period >= 1.0:  # no seconds: of milliseconds or microseconds, and of nanoseconds alone
         return [unit for unit in (*slow, *usual) if unit != "ns"] or usual
     return [*slow, *usual[:1]] if usual else slow
