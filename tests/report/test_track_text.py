@@ -93,6 +93,7 @@ def test_numbers_that_are_not_known_are_not_invented():
     assert value_words(TrackedValue(value=1.6, sd=math.inf), "ohm") == ("1.6 ohm ± ?", "")
     assert change_words(TrackedValue(value=1.0, sd=0.1), None) == ""
     assert change_words(TrackedValue(value=1.0, sd=0.1), TrackedValue(value=0.0, sd=0.1)) == ""
+    assert change_words(TrackedValue(value=1.0, sd=0.1), TrackedValue(value=1e-12, sd=0.1)) == ""
     assert change_words(TrackedValue(value=-1.1, sd=0.1), TrackedValue(value=-1.0, sd=0.1)) == "+10.00 %"
     assert speed_words(100, 1.0, math.nan) == ""
     assert speed_words(2_400_000, 120.0, 2.0) == "1.2 million samples/s, 60 times real time"

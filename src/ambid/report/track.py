@@ -143,6 +143,8 @@ def change_words(v: TrackedValue, start: TrackedValue | None) -> str:
     """
     if start is None or not math.isfinite(v.value) or not math.isfinite(start.value) or start.value == 0:
         return ""
+    if start.sd is not None and start.sd > abs(start.value):  # of a number that the start did not show
+        return ""
     percent = 100 * (v.value / start.value - 1)
     text = f"{percent:+.0f} %" if abs(percent) >= 1000 else f"{percent:+.2f} %"
     return text.replace("-0.00", "+0.00")
