@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 import ambid
+from ambid.bearing.linear import greybox
+from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
+from ambid.job.data import load_bench, signals_of
 from ambid.record import Channel, Record
 from ambid.rig import default_rig
-from ambid.validation.facts import agreements, belonging, between_samples, facts, mean_resistance, one_sided
+from ambid.validation.facts import agreements, belonging, between_samples, facts, informed, mean_resistance, one_sided
 
 RATE = 1000.0
 
@@ -175,6 +179,21 @@ def test_voltage_that_changes_between_samples_is_seen():
     assert between_samples(record(v[::10], i[::10], i[::10] ** 2))
     slow = np.convolve(v, np.hanning(60), mode="same")
     assert not between_samples(record(slow, i, i**2))
+
+
+@pytest.mark.parametrize("cause", ["sampling", "line"])
+def test_of_a_log_that_does_not_hold_what_the_coil_got_the_coil_is_not_known(cause):
+    bench = load_bench(ambid.simulate("thesis", duration=0.3, seed=1), default_rig())
+    fit = greybox(default_rig().plant, signals_of(bench, default_rig().plant), default_rig().parameters)
+    theta, spread = fit.problem.parameters(fit.vector), uncertainty(fit)
+    named = Check(passed=False, detail="", cause="fixed_value", alternatives=(cause,))
+    checks = {"causes": named, "ohm": facts(bench)["ohm"]}
+    _, wider, _ = informed(fit, default_rig(), bench, checks, spread, robust=False)
+    for name, before, after in zip(
+        spread.names, spread.standard_deviations(robust=False), wider.standard_deviations(robust=False), strict=True
+    ):
+        unknown = cause == "sampling" and name in ("R", "L")
+        assert after == pytest.approx(np.hypot(before, theta[name] if unknown else 0.0))
 
 
 def test_a_log_that_stood_still_is_named_and_coarse_steps_are_not():

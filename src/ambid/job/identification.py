@@ -344,7 +344,7 @@ def _judged(
     used, alone = None, spread.information
     if problem.model.name == "one-axis":
         facts = physical.fact_checks(fit, rig, bench, spread, robust=robust)
-        fit, spread, used = informed(fit, rig, bench, facts, spread, robust=robust)
+        fit, spread, used = informed(fit, rig, bench, {**checks, **facts}, spread, robust=robust)
         if used is not None:
             text = f"{facts['gravity_balance'].detail}. The estimate uses it"
             facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}

@@ -293,8 +293,9 @@ def informed(
     fit: Fit, rig: Rig, record: Record, facts: Mapping[str, Check], spread: Uncertainty, *, robust: bool
 ) -> tuple[Fit, Uncertainty, tuple[Array, Array] | None]:
     """Let facts tell of an estimate: what one contradicts is widened by how far apart they are, beside k_i all that
-    would move with it, cov(θ, k_i)/var(k_i) times that; the weight moves the estimate where the rig says that one
-    magnet carries it and both agree, and then gain and h are given, (n,) each.
+    would move with it, cov(θ, k_i)/var(k_i) times that; R and L by themselves where `sampling` may be the cause; the
+    weight moves the estimate where the rig says that one magnet carries it and both agree, and then gain and h are
+    given, (n,) each. `facts`: all checks.
 
     The weight says k_i - w m = 0 within a part s of k_i (of the law, the current's zero, as wrong as the means say, and
     what its check counts), h = (1, -w)/(w m) over k_i and m; with covariance P of the estimate, the gain is
@@ -307,6 +308,9 @@ def informed(
     if weight is not None and not weight.passed and "k_i" in names:
         j, far = names.index("k_i"), weight.values["expected"] - weight.values["k_i_over_m"]
         moves.append(far * theta["m"] * covariance[j] / covariance[j, j])
+    named = facts.get("causes")
+    if named is not None and not named.passed and "sampling" in (named.cause, *named.alternatives):
+        moves += [theta[name] * np.eye(n)[names.index(name)] for name in ("R", "L") if name in names]
     spread = replace(spread, apart=np.array(moves).reshape(-1, n))
     single = rig.magnet is not None and rig.magnet.kind == "single"
     if weight is None or not (weight.passed and single) or "k_i" not in names:
