@@ -1,4 +1,4 @@
-"""Jobs on the record of a bearing under feedback: physical parameters, states, and position sensors."""
+"""Jobs on the record of a bearing under feedback: physical parameters and states."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ import numpy as np
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
-from ambid.recursive.fusion import FusedSensor, SensorFusion
 from ambid.recursive.joint import JointEkf, JointStart, JointUkf
-from ambid.recursive.kalman import constant_velocity
 from ambid.tracking.evidence import Samples
 from ambid.tracking.rpem import PhysicalRpem
 from peers import Array, Bench
@@ -33,12 +31,11 @@ def _record() -> Samples:
 
 
 def bearing_jobs() -> Iterator[Job]:
-    """Jobs with physical parameters, then the fusion of sensors."""
+    """Jobs with physical parameters."""
     for memory in ("all", "auto"):
         yield _rpem(memory)
     yield _joint("joint EKF, 5 physical parameters, 3 states, 2 offsets", JointEkf, "filterpy, EKF", "ekf")
     yield _joint("joint UKF, 5 physical parameters, 3 states, 2 offsets", JointUkf, "filterpy, UKF", "ukf")
-    yield _fusion()
 
 
 def _on_record(name: str, n: int, make: Callable[[], Any], **more: Any) -> Job:
@@ -144,46 +141,4 @@ def _beside(ours: Array, sd: Array, found: dict[str, Array]) -> Same:
             "rms_error": float(mine), "peer_rms_error": float(theirs), "apart_sd": apart,
             "sd": sd.tolist(), "peer_sd": found["sd"].tolist(),
         },
-    )  # fmt: skip
-
-
-def _fusion() -> Job:
-    """Three sensors; the peer has no drift of offsets and watches none."""
-    n, n_peer = 200_000, 20_000
-    rng = np.random.default_rng(4)
-    t = np.arange(n) / RATE
-    x = 2e-5 * np.sin(2 * np.pi * 11.0 * t)
-    sd = np.array([1e-6, 1.5e-6, 2e-6])
-    y = x[:, None] + sd * rng.standard_normal((n, 3))
-    state, start_sd = constant_velocity(RATE, q=1e-2, r=1.0), np.array([1e-3, 1.0])
-    sensors = [FusedSensor(name=f"s{j}", gain=1.0, noise_sd=float(s), resolution=0.0) for j, s in enumerate(sd)]
-
-    def make() -> SensorFusion:
-        return SensorFusion(RATE, sensors, q=1e-2)
-
-    def feed() -> Callable[[int, int], object]:
-        made = make()
-        return lambda a, b: made.update(y[a:b])
-
-    def single() -> Callable[[int], object]:
-        made = make()
-        return lambda k: made.update(y[k])
-
-    orders = {
-        "A": state.A.tolist(), "C": np.tile(state.C, (3, 1)).tolist(), "Q": state.Q.tolist(),
-        "R": np.diag(sd**2).tolist(), "P0": np.diag(start_sd**2).tolist(), "truth": x[:n_peer].tolist(),
-    }  # fmt: skip
-
-    def compare(found: dict[str, Array]) -> Same:
-        ours = float(np.sqrt(np.mean((make().update(y[:n_peer])[:, 0] - x[:n_peer]) ** 2)))
-        theirs = float(found["rms"][0])
-        return Same(
-            text=f"rms error {ours * 1e9:.4g} nm, peer {theirs * 1e9:.4g} nm",
-            numbers={"rms_error_m": ours, "peer_rms_error_m": theirs},
-        )
-
-    return Job(
-        name="fusion of 3 position sensors, faults watched", n=n, feed=feed, single=single,
-        peer="filterpy, faults not watched", peer_n=n_peer,
-        ask=lambda children, _: children.ask("filterpy", "kalman", orders, y[:1], y[:n_peer]), compare=compare,
     )  # fmt: skip

@@ -75,17 +75,6 @@ def test_unstable_bearing_is_recovered_in_closed_loop():
     assert estimate.passed
 
 
-def test_sensor_fusion_finds_the_slip_and_the_temperature():
-    fusion, errors, pair = example("sensor_fusion").main()
-    assert [(e.kind, e.parameter) for e in fusion.events] == [("excluded", "b")]
-    assert fusion.events[0].t == pytest.approx(1.0, abs=1e-3)
-    assert errors["fused"] < 0.5 * errors["one sensor"]
-    assert errors["fused"] < 0.1 * errors["mean of three"]
-    assert abs(pair["upper alone, at the end"]) > 15e-6
-    assert abs(pair["fused, at the end"]) < 0.1e-6
-    assert abs(pair["temperature"] - 20.0) < IN_99_9 * pair["temperature_sd"]
-
-
 def test_the_laguerre_operator_keeps_the_condition():
     result = example("laguerre_condition").main()
     assert result.orders.tolist() == list(range(2, 21))

@@ -63,7 +63,7 @@ def test_planes_are_read_in_metres_and_written_back():
         (
             AXIS, "[channels.position]\noffset_sd = 1e-6",
             '[[channels.position.sensors]]\ncolumn = "a"\ngain_sd = 0.1\n[[channels.position.sensors]]\ncolumn = "b"',
-            r"channels\.position\.sensors\[0\]\.gain_sd .*only a whole input or output",
+            r"channels\.position: sensors of one position are not joined\. Give one column",
         ),
         (ROTOR, "value = 0.5", "value = -0.5", r"bearings\.A\.z_sd\.value is -0\.5; it must not be negative"),
         (ROTOR, '{ value = 300, unit = "um" }', "3e-4", r"bearings\.B\.z_magnet_sd is 0\.0003; it must be a \[table\]"),

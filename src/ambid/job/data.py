@@ -12,7 +12,6 @@ from ambid.errors import EstimationError
 from ambid.record import GapPolicy, Record, cut, read_record
 from ambid.record import Source as Source
 from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_from_tables, rig_text
-from ambid.rig.load import read_columns
 from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 
@@ -143,11 +142,6 @@ def load_bench(
     AmbidError
         If the file, its columns or the cut break a rule.
     """
-    if any(c.sensors for c in rig.channels):
-        from ambid.job.sensors import fused_record
-
-        columns = read_columns(record, rig, rate_hz=rate_hz, gaps=gaps, units=units, beside=beside, layout=layout)
-        record = fused_record(columns, rig)
     found = read_bench(record, rig, rate_hz=rate_hz, gaps=gaps, units=units, beside=beside, layout=layout)
     return _cut_by(rig, found, (from_s, to_s))
 

@@ -16,10 +16,8 @@ from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, began, known_rig, load_bench
 from ambid.job.identification import identify_axis
 from ambid.job.results import load_result
-from ambid.job.sensors import fused_record, sensor_events
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
-from ambid.recursive.lines import Event
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
 from ambid.settings.caller import command, saved, setting
@@ -47,7 +45,6 @@ class BenchRows:
     replay: Replay  # inputs, outputs and forcing as a stream of blocks
     forcing: Forcing | None  # where the angle of the rotor is known
     t0: float  # time of sample number 0, s of record
-    events: tuple[Event, ...] = ()  # what the fusion of several sensors decided
 
     @property
     def duration_s(self) -> float:
@@ -102,7 +99,7 @@ def rows_of(record: Source, stated: Rig | None, **reading: Unpack[Reading]) -> B
         rows = read_rows(record, rate_hz=rate, units=reading.get("units"), layout=layout)
         from_s, to_s = reading.get("from_s"), reading.get("to_s")
         bench, stamps = _part(
-            bench_record(fused_record(rows.record, rig), _with_rotation(rig, rows.record) if stated is None else rig),
+            bench_record(rows.record, _with_rotation(rig, rows.record) if stated is None else rig),
             rows.time_s,
             rig.record.from_s if from_s is None else from_s, rig.record.to_s if to_s is None else to_s,
         )  # fmt: skip
@@ -111,7 +108,7 @@ def rows_of(record: Source, stated: Rig | None, **reading: Unpack[Reading]) -> B
     stream = _stream(bench, plant, forcing)
     replay = blocks_of(stream, max(1, round(_BLOCK_S * bench.rate_hz)), time_s=stamps)
     t0 = bench.start_s if stamps is None else float(stamps[np.isfinite(stamps)][0])
-    return BenchRows(record=bench, replay=replay, forcing=forcing, t0=t0, events=sensor_events(bench))
+    return BenchRows(record=bench, replay=replay, forcing=forcing, t0=t0)
 
 
 def _with_rotation(rig: Rig, record: Record) -> Rig:

@@ -184,7 +184,6 @@ def follow(
 
     reporter = Reporter(
         supervisor, every_s=how.every_s, on_line=counted, flags=how.flags, t0=source.t0, first=first,
-        foreseen=source.events,
     )  # fmt: skip
     samples = None if live else int(np.count_nonzero(source.replay.numbers >= first))
     top = header(

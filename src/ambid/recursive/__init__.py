@@ -8,8 +8,6 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.recursive.estimator import RecursiveEstimator as RecursiveEstimator
-    from ambid.recursive.fusion import FusedSensor as FusedSensor
-    from ambid.recursive.fusion import SensorFusion as SensorFusion
     from ambid.recursive.joint import JointEkf as JointEkf
     from ambid.recursive.joint import JointStart as JointStart
     from ambid.recursive.joint import JointUkf as JointUkf

@@ -21,8 +21,7 @@ _VAGUE = 0.25  # relative standard deviation above which data do not show a para
 
 State = Literal["tracking", "frozen", "changed", "hold"]
 EventKind = Literal[
-    "change", "rejected", "accepted", "refused", "reverted", "frozen", "thawed", "operator", "disturbed", "excluded",
-    "restored",
+    "change", "rejected", "accepted", "refused", "reverted", "frozen", "thawed", "operator", "disturbed",
 ]  # fmt: skip
 
 
@@ -52,8 +51,7 @@ class Event:
     kind : str
         ``change`` (a parameter moved), ``disturbed`` (offset, noise or something unexplained changed), ``rejected``
         (samples were not used), ``accepted`` and ``refused`` (a candidate passed its validation or not), ``reverted``,
-        ``frozen`` and ``thawed`` (information went and came), ``operator`` (a flag was set), ``excluded`` and
-        ``restored`` (a sensor is not used any more, is used again; `parameter` is its name).
+        ``frozen`` and ``thawed`` (information went and came), ``operator`` (a flag was set).
     t : float
         When it happened, s of record; for a change the estimated onset.
     why : str

@@ -234,7 +234,7 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
             )
     owners: dict[str, str] = {}
-    for c in (x for channel in channels for x in (channel, *channel.sensors)):
+    for c in channels:
         if c.column in owners:
             raise RigError(
                 f"{where}: column {c.column!r} is both channels.{owners[c.column]} and channels.{c.role};"
@@ -244,30 +244,20 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     return tuple(channels)
 
 
-def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path, sensor: str = "") -> RigChannel:
-    """Build a channel, or one of several sensors of it."""
-    place = f"rig {path}: channels.{role}{sensor}"
+def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path) -> RigChannel:
+    place = f"rig {path}: channels.{role}"
     if entry.delay == "auto" and role not in plant.inputs:
         raise RigError(
             f"{place}.delay is 'auto'; it can be found for inputs only ({', '.join(plant.inputs)}). Give whole samples"
         )
-    if sensor and (entry.column is None or entry.delay is not None or entry.sensors):
-        raise RigError(f"{place} is a sensor; it needs a column, and has neither delay nor sensors. Correct it")
-    own = [x for x in ("variable", "unit", "gain", "offset", "table") if getattr(entry, x) is not None]
-    if entry.sensors and (role != "position" or own):
-        rule = f"and {own[0]}; each sensor has its own" if own else "; only a position may have several"
-        raise RigError(f"{place} has sensors {rule}. Correct it")
     return RigChannel(
         role=role,
         column=entry.column or role,
         unit=unit_of(entry.unit, place).symbol if entry.unit else None,
         calibration=calibration_of(entry, unit, place, path.parent),
-        delay=entry.delay if entry.delay is not None else "auto" if role in plant.inputs and not sensor else 0,
+        delay=entry.delay if entry.delay is not None else "auto" if role in plant.inputs else 0,
         variable=entry.variable,
-        sensors=tuple(
-            _channel(role, s, unit, plant, path, f".sensors[{k}]") for k, s in enumerate(entry.sensors or ())
-        ),
-        **channel_sd_of(entry, unit, place, known=not sensor and role in (*plant.inputs, *plant.outputs)),
+        **channel_sd_of(entry, unit, place, known=role in (*plant.inputs, *plant.outputs)),
     )
 
 
@@ -583,8 +573,7 @@ def mat_variables(rig: Rig) -> dict[str, tuple[str, str]]:
         Column name to (variable, unit); the unit is ``"?"`` where the rig gives none. ``time`` stands in it if the rig
         names a time variable.
     """
-    columns = (s for c in rig.channels for s in c.sensors or (c,))
-    variables = {c.column: (c.variable or c.column, c.unit or UNKNOWN) for c in columns}
+    variables = {c.column: (c.variable or c.column, c.unit or UNKNOWN) for c in rig.channels}
     if rig.record.time is not None:
         variables["time"] = rig.record.time
     return variables
@@ -638,16 +627,6 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     history = (*record.history, *steps, replace(SELECTED, settings=columns))
     others = (record.channel(name) for name in beside if name not in found)
     return _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
-
-
-def calibrated_column(record: Record, c: RigChannel, unit: str) -> Channel:
-    """Return the column of one of several sensors, in the unit of its role."""
-    if c.column not in record.names:
-        raise RecordError(
-            f"the record has no column {c.column!r} (needed by channels.{c.role}.sensors); it has"
-            f" {choices(c.column, record.names)} Correct its column"
-        )
-    return _calibrated(_in_declared_unit(record.channel(c.column), c), c, unit)[0]
 
 
 def _taken_back(record: Record, rig: Rig) -> Record:

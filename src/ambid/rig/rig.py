@@ -56,8 +56,6 @@ class RigChannel:
         another channel is logged later than the rest.
     variable : str or None
         Variable of a ``.mat`` file that holds the column; None: it is called like the column.
-    sensors : tuple of RigChannel
-        Two or more columns that are made into this one, where several sensors look at one position.
     gain_sd, offset_sd : float or None
         How well its calibration is known: standard deviations of the gain, relative, and of the offset in the role's
         SI unit; None: nothing is said of it.
@@ -69,7 +67,6 @@ class RigChannel:
     calibration: Calibration | None = None
     delay: int | Literal["auto"] = 0
     variable: str | None = None
-    sensors: tuple[RigChannel, ...] = ()
     gain_sd: float | None = None
     offset_sd: float | None = None
 
@@ -528,10 +525,7 @@ def _channel_lines(c: RigChannel, folder: Path, *, is_input: bool) -> list[str]:
         **(_calibration_entries(c.calibration, c.role, folder) if c.calibration else {}),
         "delay": c.delay if is_input or c.delay else None, "gain_sd": c.gain_sd, "offset_sd": c.offset_sd,
     }  # fmt: skip
-    lines = [f"[channels.{c.role}]", *toml_lines(entries)]
-    for sensor in c.sensors:
-        lines += ["", f"[[channels.{c.role}.sensors]]", *_channel_lines(sensor, folder, is_input=False)[1:]]
-    return lines
+    return [f"[channels.{c.role}]", *toml_lines(entries)]
 
 
 def _calibration_entries(calibration: Calibration, role: str, folder: Path) -> dict[str, object]:

@@ -61,7 +61,6 @@ class ChannelEntry(_Entry):
     """``[channels.<role>]``: which column is this role, and how its values become the role's unit."""
 
     column: Name | None = None
-    sensors: Annotated[tuple[ChannelEntry, ...], Field(min_length=2)] | None = None
     variable: Text | None = None
     unit: Text | None = None
     gain: Number | None = None
@@ -373,6 +372,8 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     if kind == "extra_forbidden":
         *table, key = keys
         own = list(_keys(_entry_at(table)))
+        if table[:1] == ["channels"] and key == "sensors":
+            return f"{'.'.join(table)}: sensors of one position are not joined. Give one column, such as their mean"
         inside = f"in [{'.'.join(table)}]" if table else "at the top"
         return f"unknown key {key!r} {inside}; known: {choices(key, own)}"
     if kind == "missing" and keys[-1] != "duty" and "limits" not in keys[:-1] and "trip" not in keys[:-1]:

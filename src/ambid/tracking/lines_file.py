@@ -30,8 +30,7 @@ _dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, check_circular=Fa
 
 # What a reader has to know first, when several things happened in one reporting interval.
 _IMPORTANCE = (
-    "change", "reverted", "excluded", "disturbed", "refused", "accepted", "operator", "restored", "rejected", "frozen",
-    "thawed",
+    "change", "reverted", "disturbed", "refused", "accepted", "operator", "rejected", "frozen", "thawed",
 )  # fmt: skip
 
 

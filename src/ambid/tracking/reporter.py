@@ -4,7 +4,7 @@ whatever the blocks; where samples are missing or rejected the lines go on, and 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -25,9 +25,8 @@ _EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
 class Reporter:
     """Feeds a supervisor, whose listener is `Reporter.note`, and makes lines of what it says. `every_s`: reporting
     interval, s, at least a sample; `on_line`: called with each line, may return the operator's flags; `flags`: what is
-    set when, s of record; `t0`: time of sample 0, s of record; `first`: number of the first tracked sample; `foreseen`:
-    events known before, told in the line of their time. `lines`, `samples`, `rejected`: lines made, samples used,
-    samples rejected.
+    set when, s of record; `t0`: time of sample 0, s of record; `first`: number of the first tracked sample. `lines`,
+    `samples`, `rejected`: lines made, samples used, samples rejected.
     """
 
     def __init__(
@@ -39,10 +38,8 @@ class Reporter:
         flags: Sequence[tuple[float, str]] = (),
         t0: float = 0.0,
         first: int = 0,
-        foreseen: Sequence[Event] = (),
     ) -> None:
         self.supervisor, self._on_line, self._t0 = supervisor, on_line, t0
-        self._foreseen = deque(sorted(foreseen, key=lambda event: event.t))
         self._rate = supervisor.rpem.numbers.rate_hz
         self.every_s = max(every_s, 1.0 / self._rate)
         self._count = int(first / (self.every_s * self._rate))
@@ -123,8 +120,6 @@ class Reporter:
         s = self.supervisor
         self._obey(self._next)
         s.wait(self._next)
-        while self._foreseen and self._foreseen[0].t <= self._t0 + self._count * self.every_s:
-            self.note(self._foreseen.popleft())
         events, self._events = tuple(self._events), []
         line = TrackLine(
             t=self._t0 + self._count * self.every_s,
