@@ -1,4 +1,4 @@
-"""Laws of an optimal method are searched among those that the controller can hold."""
+"""LQG laws are searched among those that the controller can hold."""
 
 import ambid.control.knobs as room
 from ambid.acquisition.settings import held_by
@@ -25,7 +25,7 @@ def test_the_quietest_law_fits_in_the_words_of_the_controller(monkeypatch):
 
     monkeypatch.setattr(room, "held_by", count)
     monkeypatch.setattr(room, "_FINEST", 1.5)
-    law = room.design_hinf(plants, rig, goals, silent)
+    law = room.design_lqg(plants, rig, goals, silent)
     assert refused  # modes that nearly cancel: such laws are tried here, and passed over
     held = examine(plant, held_by(rig, law), noise).figures
     assert held.stable

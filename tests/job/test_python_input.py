@@ -20,7 +20,7 @@ EXPERIMENT = (
 )  # fmt: skip
 CONTROLLER = (
     {"goals": 5}, {"goals": "peak"}, {"limits": 5}, {"limits": {"peak": "a"}}, {"spread": 5}, {"method": ["pid"]},
-    {"filters": -1}, {"schedule": 0}, {"schedule": 2.5}, {"plants": 2.5}, {"seed": -1}, {"rig": 5},
+    {"filters": -1}, {"plants": 2.5}, {"seed": -1}, {"rig": 5},
     {"speeds_rpm": (1,)}, {"form": [1]},
 )  # fmt: skip
 SIMULATION = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +9,8 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.control.closed import Plant
 from ambid.control.controller import controller_of_loop
 from ambid.errors import ModelError, RigError
-from ambid.estimation.progress import silent
-from ambid.job.controller_design import _scheduled
 from ambid.physics.law import StateLaw, beside
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
@@ -161,22 +157,3 @@ def test_the_law_nearest_to_the_speed_of_a_rotor_orders(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.D, law.D)
     with pytest.raises(ModelError, match="the first of its laws"):
         Loop(law=second, laws=loop.laws)
-
-
-def test_each_law_of_a_schedule_is_designed_on_the_plants_near_its_speed() -> None:
-    rig = as_law(rig_of_preset(ambid.preset("central-mass")))
-    assert rig.loop is not None
-    assert rig.loop.law is not None
-    assert isinstance(rig.plant, RotorModel)
-    theta = {p.name: p.value or 0.0 for p in rig.parameters}
-    at_rest = Plant.of(rig.plant.at_speed(0.0), theta, {}, rig.loop.law.rate_hz)
-    plants = [replace(at_rest, model=rig.plant.at_speed(speed)) for speed in (0.0, 90.0, 200.0, 260.0)]
-    seen: list[list[float]] = []
-
-    def design(of: Sequence[Plant], _rig: Rig, _goals: object, _tick: object) -> Loop:
-        seen.append([p.model.speed for p in of if isinstance(p.model, RotorModel)])
-        return rig.loop or Loop()
-
-    loop = _scheduled(design, 300.0, 3)(plants, rig, None, silent)  # type: ignore[arg-type]
-    assert seen == [[0.0], [150.0, 90.0, 200.0], [300.0, 260.0]]
-    assert [speed for speed, _ in loop.laws] == [0.0, 150.0, 300.0]

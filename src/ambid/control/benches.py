@@ -80,11 +80,11 @@ class Workbench:
         return abs(theta[f"{prefix}k_i"]) * min(ways)
 
     def respond(
-        self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | Array | None = None,
+        self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | None = None,
         seed: int | None = None, linear: bool = False,
     ) -> Answer:  # fmt: skip
         """Simulate `n` samples, with noise where a seed is given: `load` (n, n_axes), N; `start` (n_axes,) from rest,
-        m, without current and speed; `speed` of rotation, or (n,), default the plant's own.
+        m, without current and speed; `speed` of rotation, default the plant's own.
         """
         raise NotImplementedError
 
@@ -124,7 +124,6 @@ def _gap(rig: Rig, farthest: float) -> tuple[float, str]:
 
 
 _FAST = 2.0  # eddy pole over the rate from which it is taken as a delay: small steps cost time
-_EVEN = 200  # samples of the same speed in a run-up
 _INTEGRAL = 1e-6  # distance of an integrator's pole from 1
 _LINEAR = "the magnet is simulated as linear, which says too little of large motions: "
 _BEYOND = "; what lies beyond the neighbourhood of rest is assumed"
@@ -180,7 +179,7 @@ class _OneAxis(Workbench):
         return self.point
 
     def respond(
-        self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | Array | None = None,  # noqa: ARG002
+        self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | None = None,  # noqa: ARG002
         seed: int | None = None, linear: bool = False,  # noqa: ARG002
     ) -> Answer:  # fmt: skip
         """Simulate; an axis knows no speed, and `linear` is what it is."""
@@ -317,29 +316,24 @@ class _Rotor(Workbench):
         return turned if all(p.name in names or p.default is not None for p in turned.parameters) else self.model
 
     def respond(
-        self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | Array | None = None,
+        self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | None = None,
         seed: int | None = None, linear: bool = False,
     ) -> Answer:  # fmt: skip
-        """Simulate, with magnets that are linear where `linear`; a speed that changes does so in small steps."""
-        rotor, noise = self.model, _quiet(self.noise) if seed is None else self.noise
-        n_axes, size = len(rotor.axes), _EVEN if isinstance(speed, np.ndarray) else n
-        running, parts, limited, over = None, [], 0, 0
-        for k in range(0, n, size):
-            rotor = self.at_speed(float(speed[k : k + size].mean()) if isinstance(speed, np.ndarray) else speed)
-            bench = RotorBench(
-                rig=replace(self.rig, noise=noise), plant=LinearPlant(model=rotor, parameters=self.plant.theta),
-                loop=self.loop, rate_hz=self.plant.rate_hz, shapes={}, poles=None if linear else self.poles,
-            )  # fmt: skip
-            running = running or bench.begun(None if start is None else _placed(rotor, self.plant.theta, start))
-            done = bench.simulate(
-                np.zeros((min(size, n - k), len(rotor.inputs))), seed=(seed or 0) + k, columns=False, start=running,
-                load=None if load is None else load[k : k + size],
-            )  # fmt: skip
-            commands = np.column_stack([done.record[name].values for name in rotor.inputs])
-            parts.append((done.states[:, :n_axes], done.states[:, n_axes:], commands))
-            limited, over = limited + done.n_saturated, over + done.n_over_current
-        position, current, command = (np.concatenate(x) for x in zip(*parts, strict=True))
-        return Answer(position, current, command, limited, over)
+        """Simulate, with magnets that are linear where `linear`."""
+        rotor, noise = self.at_speed(speed), _quiet(self.noise) if seed is None else self.noise
+        bench = RotorBench(
+            rig=replace(self.rig, noise=noise), plant=LinearPlant(model=rotor, parameters=self.plant.theta),
+            loop=self.loop, rate_hz=self.plant.rate_hz, shapes={}, poles=None if linear else self.poles,
+        )  # fmt: skip
+        done = bench.simulate(
+            np.zeros((n, len(rotor.inputs))), seed=seed or 0, columns=False, load=load,
+            start=bench.begun(None if start is None else _placed(rotor, self.plant.theta, start)),
+        )  # fmt: skip
+        command = np.column_stack([done.record[name].values for name in rotor.inputs])
+        n_axes = len(rotor.axes)
+        return Answer(
+            done.states[:, :n_axes], done.states[:, n_axes:], command, done.n_saturated, done.n_over_current
+        )  # fmt: skip
 
 
 def _placed(rotor: RotorModel, theta: Mapping[str, float], positions: Array) -> Array:

@@ -315,8 +315,7 @@ class OverSpeed:
     """The highest peak of the sensitivity over some of the plants that judge, by the speed of the rotor."""
 
     speed: Array  # (n,), rad/s
-    # "before", "after" and, of a schedule, "one law": the best of its laws alone; (n,), as a ratio, infinite where one
-    # of the plants is not held
+    # "before" and "after", (n,), as a ratio, infinite where one of the plants is not held
     peak: Mapping[str, Array]
 
     @classmethod
@@ -328,9 +327,7 @@ class OverSpeed:
             turned = [[replace(p, model=_turning(p.model, w)) for p in plants] for w in at.tolist()]
             return np.array([max(examine(p, loop, (0.0, 0.0)).figures.peak for p in each) for each in turned])
 
-        alone = [peaks(Loop(law=law, delay=loop.delay)) for loop in loops.values() for _, law in loop.laws]
-        one = {"one law": min(alone, key=np.max)} if alone else {}
-        return cls(speed=at, peak={**{name: peaks(loop) for name, loop in loops.items()}, **one})
+        return cls(speed=at, peak={name: peaks(loop) for name, loop in loops.items()})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

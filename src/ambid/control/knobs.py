@@ -1,5 +1,5 @@
-"""Laws of an optimal method, whose few knobs are set by the worst of many plants, as LQG promises nothing on others
-than its own (Doyle 1978): a grid, then along each knob. Of responses computed once, y = H w and w = W y:
+"""LQG, whose few knobs are set by the worst of many plants, as it promises nothing on others than its own (Doyle
+1978): a grid, then along each knob. Of responses computed once, y = H w and w = W y:
 
 S = (I - H W)⁻¹ at the positions, x/f = G_x + H_x W (I - H W)⁻¹ G_y, w/n = W (I - H W)⁻¹.
 
@@ -21,7 +21,7 @@ from ambid.acquisition.settings import held_by
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import Goals, closed_loop_of, examine, mean_over, noise_of, worst_of
-from ambid.control.lqg import SampledPlant, Weights, hinf, lqg, reduced
+from ambid.control.lqg import SampledPlant, Weights, lqg, reduced
 from ambid.control.tuning import raised, said
 from ambid.control.zones import ZONES
 from ambid.errors import EstimationError, ModelError, RigError
@@ -41,7 +41,6 @@ _FIRST, _FINEST = 4.0, 1.15  # factors on the knobs between tries
 
 Knobs = tuple[float, ...]
 Make = Callable[[Knobs], StateLaw]
-LawOf = Callable[[Plant, Weights, Noise, float, float], StateLaw]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,7 +185,7 @@ def _ways(n: int) -> list[tuple[int, ...]]:
 
 
 def design_by_knobs(
-    make: Make, grid: Sequence[Knobs], plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, name: str
+    make: Make, grid: Sequence[Knobs], plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick
 ) -> Loop:
     """Return the loop whose law does best on the worst plant; EstimationError where none meets the limits."""
     noise, score = noise_of(rig.noise, {})[:2], Score.of(goals)
@@ -211,10 +210,10 @@ def design_by_knobs(
             return loop
         score.limits["settling"] = figures["settling"] * math.exp(-_SLACK) / over
         grid = [*grid, best]
-    raise EstimationError(_refusal(tries, score, grid, name))
+    raise EstimationError(_refusal(tries, score, grid))
 
 
-def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> str:
+def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs]) -> str:
     """Say which limit to move, and how far: the one that has to give way least, the others kept."""
     ways, goals = [], score.goals
     for limit in goals.limits:
@@ -224,26 +223,20 @@ def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> s
             ways.append((figures[limit] / score.limits[limit], limit))
     limits = ", ".join(said(n, x) for n, x in goals.limits.items())
     if not ways:
-        return (
-            f"no {name} law meets the limits ({limits}), nor where any one of them is left out. Raise several of them"
-        )
+        return f"no LQG law meets the limits ({limits}), nor where any one of them is left out. Raise several of them"
     ratio, limit = min(ways)
     least = ratio * goals.limits[limit]
     return (
-        f"no {name} law meets the limits ({limits}) on all plants; with the others kept, {said(limit, least)} is the "
+        f"no LQG law meets the limits ({limits}) on all plants; with the others kept, {said(limit, least)} is the "
         f"least. Give {raised(limit, least)}, or raise another"
     )
 
 
-def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of: LawOf, name: str) -> Loop:
-    """Return a method's law for the first of some plants, its knobs (effort, disturbances, time of the integral) set by
-    all.
-    """
+def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+    """Return the law for the first of some plants, its knobs (effort, disturbances, integral's time) set by all."""
     limits, settling = rig.limits, goals.limits.get("settling", goals.reference["settling"])
     if limits is None:
-        raise EstimationError(
-            f"the rig gives no [limits]; {name} weighs by them. Give limits.position and limits.voltage"
-        )
+        raise EstimationError("the rig gives no [limits]; LQG weighs by them. Give limits.position and limits.voltage")
     noise = rig.noise or Noise()
     grid = [
         (_FIRST**a, _FIRST**b, settling / (c * _SETTLED))
@@ -254,7 +247,7 @@ def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of:
 
     def make(knobs: Knobs) -> StateLaw:
         weights = Weights.of(limits, knobs[2])
-        law = law_of(plants[0], weights, noise, knobs[0], knobs[1])
+        law = lqg(plants[0], weights, noise, effort=knobs[0], disturbance=knobs[1]).law
         if rig.daq is None:
             return law
         each = [weights.position, weights.current if math.isfinite(weights.current) else 1.0]
@@ -265,20 +258,6 @@ def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of:
                 less = reduced(law, order, sizes, weights.command)[0]
                 held_by(rig, Loop(law=less))
                 return less
-        raise EstimationError(f"no {name} law of these weights fits in the words of the rig's controller")
+        raise EstimationError("no LQG law of these weights fits in the words of the rig's controller")
 
-    return design_by_knobs(make, grid, plants, rig, goals, tick, name)
-
-
-def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-    """Return the loop of `ambid.control.lqg`."""
-    return _design(
-        plants, rig, goals, tick, lambda p, w, n, e, d: lqg(p, w, n, effort=e, disturbance=d).law, "LQG"
-    )  # fmt: skip
-
-
-def design_hinf(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-    """Return the loop of `ambid.control.lqg`."""
-    return _design(
-        plants, rig, goals, tick, lambda p, w, n, e, d: hinf(p, w, n, effort=e, disturbance=d)[0], "H-infinity"
-    )  # fmt: skip
+    return design_by_knobs(make, grid, plants, rig, goals, tick)

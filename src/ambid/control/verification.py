@@ -26,7 +26,7 @@ from ambid.rig.rig import Rig
 from ambid.simulation.plant import closed_loop_poles
 from ambid.simulation.scenarios import GRADE, TOP_SPEED
 
-KINDS = ("lift-off", "force step", "impact", "unbalance", "noise", "limit cycle", "run-up")
+KINDS = ("lift-off", "force step", "impact", "unbalance", "noise", "limit cycle")
 """What is tried, in the order in which it is told."""
 
 ORBIT = 0.4
@@ -57,7 +57,6 @@ class Trials:
     # kg m; default that of the rig, else balance quality G 2.5 (ISO 21940-11) at the highest speed
     unbalance: float | None = None
     speed: float | None = None  # highest, rad/s; default the rotor's own, else 15 000 rpm
-    run_up: bool = False  # from rest to the highest speed, the laws of a schedule taking turns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,7 +127,7 @@ def verify(
     bench, todo = workbench(plant, rig, loop, nonlinear=nonlinear), trials or Trials()
     trying = _Trying(bench=bench, trials=todo, seed=seed)
     cases = [*trying.lift_off(), *trying.force_steps(), *trying.impacts(), *trying.unbalance()]
-    cases += [*trying.noise(), *trying.limit_cycle, *trying.run_up()]
+    cases += [*trying.noise(), *trying.limit_cycle]
     return Verification(
         plant=name,
         clearance=trying.clearance if math.isfinite(trying.clearance) else None,
@@ -432,33 +431,14 @@ class _Trying:
             cases.append(self._orbit(answers[at], speeds[at], f"{kind} unbalance", np.array(speeds), most))
         return cases
 
-    def run_up(self) -> list[Case]:
-        """Run up from rest with the static unbalance, the commands of one law handed over to the next."""
-        if not self.trials.run_up:
-            return []
-        n = round(_RUN_UP_S * self.rate_hz)
-        speed: Array = self.speed * np.arange(1, n + 1, dtype=np.float64) / n
-        angle: Array = np.cumsum(speed) / self.rate_hz
-        load = self._whirl(self._shares()["static"], speed, angle)
-        try:
-            answer = self.bench.respond(n, load=load, speed=speed)
-        except ModelError as problem:
-            return [self.broken("run-up", "run-up", problem)]
-        edges = np.linspace(0, n, _POINTS, endpoint=False).astype(int)
-        most = [np.maximum.reduceat(np.abs(x).max(axis=1), edges) for x in answer[:3]]
-        at = int(np.argmax(np.abs(answer.position).max(axis=1)))
-        return [self._orbit(answer, float(speed[at]), "run-up", speed[edges], most, kind="run-up")]
-
-    def _orbit(
-        self, answer: Answer, speed: float, name: str, at: Array, most: Sequence[Array], kind: str = "unbalance"
-    ) -> Case:
+    def _orbit(self, answer: Answer, speed: float, name: str, at: Array, most: Sequence[Array]) -> Case:
         peak = float(np.abs(answer.position).max())
         share = peak / self.clearance if math.isfinite(self.clearance) else 0.0
         text = f"at most {_length(peak)} at {speed * _RPM:.0f} rpm"
         text += f", {100.0 * share:.3g} % of the clearance" if share else ""
         text += f", more than the {100.0 * ORBIT:g} % of ISO 14839-2 zone B" if share > ORBIT else ""
         return self.case(
-            kind, name, answer, text, size=self.moment, unit="kg m", passed=share <= ORBIT,
+            "unbalance", name, answer, text, size=self.moment, unit="kg m", passed=share <= ORBIT,
             trace=Trace(over="speed", at=at, position=most[0], current=most[1], command=most[2]),
         )  # fmt: skip
 

@@ -39,7 +39,7 @@ from ambid.control.design import (
 )
 from ambid.control.drawn import Draws, Spread, draw_plants, laws_of, magnet_check, over_speeds
 from ambid.control.gain_sets import FORMS
-from ambid.control.verification import Trials, checks_of_verifications, verify_all
+from ambid.control.verification import checks_of_verifications, verify_all
 from ambid.control.zones import zone_of
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
@@ -48,9 +48,7 @@ from ambid.estimation.progress import Tick, part_of, silent
 from ambid.job.closed_loop import Numbers, plant_of
 from ambid.job.data import Clock, RigSource, rig_entry
 from ambid.job.loop_margins import given, noise_by_name, of_plant
-from ambid.physics.law import StateLaw
 from ambid.physics.loop import Interval, Loop, Noise
-from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import by_name, check_whole
@@ -74,13 +72,7 @@ def _lqg() -> Method:
     return design_lqg
 
 
-def _hinf() -> Method:
-    from ambid.control.knobs import design_hinf
-
-    return design_hinf
-
-
-METHODS: Mapping[str, Callable[[], Callable[..., Loop]]] = {"pid": _pid, "lqg": _lqg, "hinf": _hinf}
+METHODS: Mapping[str, Callable[[], Callable[..., Loop]]] = {"pid": _pid, "lqg": _lqg}
 """By the name that ``method`` takes: what designs is imported when it is asked for."""
 
 
@@ -96,7 +88,6 @@ def design_controller(
     form: str = "axes",
     filters: int = 0,
     speeds_rpm: tuple[float, float] | None = None,
-    schedule: int = 1,
     plants: int = 60,
     seed: int = 0,
     tick: Tick | None = None,
@@ -114,7 +105,7 @@ def design_controller(
         The plant, as `ambid.identify` finds it.
     rig : Rig, path, dict or TOML text, optional
         With the present ``[loop]``; default: that of the estimate.
-    method : {"pid", "lqg", "hinf"}
+    method : {"pid", "lqg"}
         "pid": the present structure, tuned; "lqg" and "hinf": a state-space law with integral action by the
         mean or the worst of noise and disturbances, its weights tuned.
     goals : sequence of {"peak", "compliance", "noise", "settling"}
@@ -130,8 +121,6 @@ def design_controller(
         Around so many of a rotor's lowest bending modes the PID has a filter each, a notch or a phase lead.
     speeds_rpm : (float, float), optional
         Of a rotor, between which the plants turn; default: from rest to the speed of rig or estimate.
-    schedule : int
-        Laws over these speeds, of which the nearest orders; of "lqg" and "hinf".
     plants : int
         How many the design is tuned over; 200 others judge it.
     seed : int
@@ -172,14 +161,10 @@ def design_controller(
         raise EstimationError(f"method {method!r} of a design is unknown; known: {names} Give one of them")
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
-    check_whole({"plants": plants, "schedule": schedule}, 1)
+    check_whole({"plants": plants}, 1)
     check_whole({"seed": seed, "filters": filters})
     design = _method(method, form, filters)
     speeds = _speeds(known, bench, speeds_rpm)
-    if schedule > 1:
-        if method == "pid" or speeds is None:
-            raise EstimationError("a schedule is of lqg or hinf on a rotor that turns. Omit it, or give both")
-        design = _scheduled(design, speeds[1], schedule)
     with one_thread():
         problem = _problem(known, bench, sources, plants, seed, speeds)
         found = _designed(problem, method, design, goals, asked, say, clock)
@@ -230,24 +215,6 @@ def _method(name: str, form: str, filters: int) -> Method:
             f"form {form!r} of gains is unknown: {', '.join(FORMS)}.{nearest(form, list(FORMS))} Give one of them"
         )
     return partial(METHODS[name](), form=form, filters=filters)
-
-
-def _scheduled(design: Method, top: float, n: int) -> Method:
-    """Return the method that makes `n` laws over speeds up to one in rad/s, each on the plants nearest to its own."""
-
-    def method(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-        knots, laws, of = np.linspace(0.0, top, n), list[tuple[float, StateLaw]](), plants[0].model
-        assert isinstance(of, RotorModel)
-        nearest = [int(np.argmin(np.abs(knots - abs(getattr(p.model, "speed", 0.0))))) for p in plants]
-        for k, speed in enumerate(knots.tolist()):
-            own = [p for p, at in zip(plants[1:], nearest[1:], strict=True) if at == k]
-            told = part_of(tick, k / n, (k + 1) / n) or silent
-            found = design([replace(plants[0], model=of.at_speed(speed)), *own], rig, goals, told)
-            assert found.law is not None
-            laws.append((speed, found.law))
-        return replace(found, law=laws[0][1], laws=tuple(laws))
-
-    return method
 
 
 def _speeds(known: Numbers, bench: Rig, given: tuple[float, float] | None) -> Interval | None:
@@ -353,12 +320,9 @@ def _result(
     worst = worst_plant(of.judging.plants, seen)
     bench = replace(of.bench, noise=of.bench.noise or of.rig.noise)  # with its resolutions
     tried = hardest(of.judging.plants, seen)
-    todo, both = (
-        Trials(run_up=True, speed=of.speeds[1]) if loop.laws and of.speeds else Trials(),
-        {name: x for name, (x, _) in zip(("before", "after"), loops, strict=True)},
-    )
+    both = {name: x for name, (x, _) in zip(("before", "after"), loops, strict=True)}
     trials = {
-        name: verify_all(tried, bench, x, trials=todo, tick=part_of(say, a, a + 0.5) or silent)
+        name: verify_all(tried, bench, x, tick=part_of(say, a, a + 0.5) or silent)
         for name, (x, _), a in zip(("before", "after"), loops, (0.0, 0.5), strict=True)
     }
     checks = {**checks_of(goals, was, now, worst, len(seen)), **checks_of_verifications(trials["after"])}

@@ -208,7 +208,6 @@ def _over_speed(axes: Axes, design: Design) -> None:
             decibels,
             color=color,
             marker=".",
-            linestyle="--" if name == "one law" else "-",
             label=name,
         )
     zone_lines(axes)
@@ -264,7 +263,7 @@ def _between(axes: Axes, f: Array, mean: Array | None, high: Array | None, color
             axes.fill_between(f, mean, high, color=color, alpha=0.25, linewidth=0.0, label=f"{name}, plants around it")
 
 
-_DRAWN = (*KINDS[:4], "run-up")
+_DRAWN = KINDS[:4]
 
 _MEANING = (
     "limits, quantisation and delay act; lift-off: time to rest, overshoot; force step, impact: largest deflection, "

@@ -145,8 +145,6 @@ SETTINGS = (
         "0:20000 is a run-up, 20000:0 a coast-down, 0:20000:0 both; the record has its angle and speed."),
     Setting("scenario", "text", "NAME[:SIZE][@S]", "A change with known truth, as 'ambid models' lists them, its "
         "size and its start in s; the truth goes into columns true_....", shown="nothing changes"),
-    Setting("schedule", "whole", "N", "Laws over a rotor's speeds, of which the nearest orders; lqg, hinf.", least=1,
-        default=1),
     Setting("scheduler", "text", "local:N|tcp://HOST:PORT", "Cluster of Dask: N workers on this machine, or a "
         "scheduler that somebody has started, with its workers."),
     Setting("seconds", "positive", "S", "Length of the record in s.", default=10.0),
