@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -55,3 +55,19 @@ def runaway(n: int = 300) -> IOData:
         units={"u1": "V", "y": "m"},
         open_loop=True,
     )
+
+
+class MatrixCandidates:
+    """Candidates for `select_terms` that are columns of a matrix (n_rows, n_candidates)."""
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self.matrix, self.n_rows, self.terms = matrix, matrix.shape[0], range(matrix.shape[1])
+
+    def blocks(self, which: Sequence[int] | None = None) -> Iterator[tuple[slice, np.ndarray]]:
+        """As `Candidates.blocks`."""
+        chosen = self.matrix if which is None else self.matrix[:, list(which)]
+        yield slice(0, self.n_rows), np.array(chosen.T, order="C")
+
+    def columns(self, which: Sequence[int]) -> np.ndarray:
+        """As `Candidates.columns`."""
+        return self.matrix[:, list(which)]

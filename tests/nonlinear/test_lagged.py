@@ -32,17 +32,17 @@ RBF = {
 }
 
 
-class Rational(LaggedFunction):
-    """Two outputs, terms of degree three over a denominator, innovations in it that bend or do not."""
+class Noisy(LaggedFunction):
+    """Two outputs, terms of degree three, innovations that bend or do not."""
 
     kind = "test"
 
-    def __init__(self, *, bends: bool, below: bool = True) -> None:
+    def __init__(self, *, bends: bool) -> None:
         x = lags(2, 1, ny=2, nu=1, nk=0, ne=1)  # y1(t-1) y1(t-2) y2(t-1) y2(t-2) u(t) e1(t-1) e2(t-1)
         num = [(0,), (0, 2, 4), (3, 3), (5,), (6, 6) if bends else (6, 4)]
-        terms = [(0, t, 0) for t in num] + [(0, (1, 1), 1)] * below + [(1, t, 0) for t in [(2,), (4,), (0, 6), (5,)]]
-        table = np.array([[*t, *[-1] * (3 - len(t))] for _, t, _ in terms], dtype=np.int64)
-        place = np.array([[o, d] for o, _, d in terms], dtype=np.int64)
+        terms = [(0, t) for t in num] + [(1, t) for t in [(2,), (4,), (0, 6), (5,)]]
+        table = np.array([[*t, *[-1] * (3 - len(t))] for _, t in terms], dtype=np.int64)
+        place = np.array([o for o, _ in terms], dtype=np.int64)
         self._x, self._terms = x, Terms(n_outputs=2, terms=table, place=place)
 
     @property
@@ -61,13 +61,13 @@ class Rational(LaggedFunction):
         return {}
 
     @classmethod
-    def from_json(cls, found: dict[str, object]) -> Rational:
+    def from_json(cls, found: dict[str, object]) -> Noisy:
         raise NotImplementedError
 
 
 NOISY = {
-    "rational, affine in e": Rational(bends=False),
-    "rational, bent in e": Rational(bends=True),
+    "affine in e": Noisy(bends=False),
+    "bent in e": Noisy(bends=True),
 }
 FUNCTIONS: dict[str, LaggedFunction] = {**NARX, **RBF, **NOISY}
 every = pytest.mark.parametrize("f", FUNCTIONS.values(), ids=FUNCTIONS)
@@ -138,9 +138,9 @@ def test_a_compiled_run_is_the_function_of_its_own_past(f: LaggedFunction) -> No
 
 
 def test_a_linear_filter_of_the_innovations_is_the_recursion() -> None:
-    f = Rational(bends=False)
+    f = Noisy(bends=False)
     assert f.affine
-    assert not Rational(bends=True).affine
+    assert not Noisy(bends=True).affine
     theta, (y, u) = gentle(f), signals(f, 80)
     mine, rows = f.predict(theta, f.rows(y, u))
     z = f.regressors.signals(y, u)
@@ -150,7 +150,7 @@ def test_a_linear_filter_of_the_innovations_is_the_recursion() -> None:
 
 @pytest.mark.parametrize("free", [False, True])
 def test_the_triangle_is_that_of_weighted_slopes_errors_and_prior(free: bool) -> None:
-    f = Rational(bends=False)
+    f = Noisy(bends=False)
     theta, (y, u) = gentle(f), signals(f, 5000)
     precision = np.arange(f.n_theta) / 3.0
     at = problem_at(f, ((y, u), (y[:50], u[:50])), theta, precision, free=free)

@@ -404,7 +404,7 @@ class NonlinearStructure:
 NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {
     name: NonlinearStructure(name=name, summary=summary)
     for name, summary in {
-        "narmax": "polynomial or rational difference equation; terms by orthogonal least squares; noise model",
+        "narmax": "polynomial difference equation; terms by orthogonal least squares; noise model",
         "nn": "state-space network whose weights are A and B (thesis fig. 5.9), with a network G(x, u)",
         "narx": "neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
         "lpv": "linear model whose coefficients follow a scheduling signal such as the set point; error model",

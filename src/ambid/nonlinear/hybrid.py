@@ -133,15 +133,15 @@ class HybridFunction(LaggedFunction):
         """What the network sees, innovations, then whatever else the terms look at."""
         x = lags(self.p, self.m, ny=self.ny, nu=self.nu, nk=self.nk, ne=self.ne)
         pairs = set(zip(x.column.tolist(), x.back.tolist(), strict=True))
-        factors = {(column_of(f, self.p, self.m), f.lag) for _, _, term in self.owned for f in term}
+        factors = {(column_of(f, self.p, self.m), f.lag) for _, term in self.owned for f in term}
         more = np.array(sorted(factors - pairs), dtype=np.int64).reshape(-1, 2)
         column, back = np.append(x.column, more[:, 0]), np.append(x.back, more[:, 1])
         return Regressors(n_outputs=self.p, n_inputs=self.m, column=column, back=back)
 
     @property
-    def owned(self) -> tuple[tuple[int, int, Term], ...]:
-        """Output, 0, and term of each coefficient of the polynomial."""
-        return tuple((o, 0, term) for o, one in enumerate(self.terms) for term in one)
+    def owned(self) -> tuple[tuple[int, Term], ...]:
+        """Output and term of each coefficient of the polynomial."""
+        return tuple((o, term) for o, one in enumerate(self.terms) for term in one)
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -186,7 +186,7 @@ class HybridFunction(LaggedFunction):
 
     def unit(self, y_scale: Array, u_scale: Array) -> Array:
         """Coefficients of the polynomial and of C are in SI; weights of the network stay scaled."""
-        owned = (*self.owned, *((o, 0, x) for o in range(self.p) for x in self.noise_terms))
+        owned = (*self.owned, *((o, x) for o in range(self.p) for x in self.noise_terms))
         return np.concatenate([unit_of(owned, y_scale, u_scale), np.ones(self.n_theta - self.n_linear)])
 
     def noise_radius(self, theta: Array) -> float:
@@ -290,8 +290,8 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
 def _polynomial(s: HybridSettings, model: LaggedModel) -> tuple[HybridFunction, Array]:
     """The polynomial model as a hybrid without neurons, its chosen noise terms in a full C."""
     assert isinstance(model.function, PolynomialFunction)
-    terms = tuple(tuple(x for x in one if not is_noisy(x)) for one in model.function.numerators)
-    ne = max((f.lag for _, _, x in model.function.owned for f in x if f.kind == "e"), default=0)
+    terms = tuple(tuple(x for x in one if not is_noisy(x)) for one in model.function.terms)
+    ne = max((f.lag for _, x in model.function.owned for f in x if f.kind == "e"), default=0)
     function = HybridFunction(
         terms=terms, ne=ne if s.ne is None else s.ne, p=model.n_outputs, m=model.n_inputs, ny=s.ny, nu=s.nu, nk=s.nk,
         neurons=0,
@@ -480,12 +480,12 @@ def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tic
         m = max(draft.details["candidates"] * function.p, function.n_linear)
         price = penalty("ebic", function.n_linear, n, m) - penalty("ebic", function.n_linear - 1, n, m)
         shared = _inflation(R, P, function.n_linear)[: function.n_terms] > _SHARED
-        alone = np.array([len(function.terms[o]) == 1 for o, _, _ in function.owned])
+        alone = np.array([len(function.terms[o]) == 1 for o, _ in function.owned])
         loss = np.where(shared | alone, np.inf, (theta**2 / np.diag(P))[: function.n_terms])
         worst = int(np.argmin(loss))
         if not loss[worst] < price:
             return
-        o, _, term = function.owned[worst]
+        o, term = function.owned[worst]
         fewer = replace(
             function, terms=tuple(tuple(x for x in t if (q, x) != (o, term)) for q, t in enumerate(function.terms))
         )

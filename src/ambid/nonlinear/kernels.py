@@ -47,11 +47,11 @@ def run(
     """Run a sum of blocks over z (n, outputs + inputs + innovations) from sample `lag` on: predict and write
     innovations into z, or if `free` own outputs; `out` (n, n_outputs) is NaN elsewhere, and from a divergence on.
     `shape` = (lag, n_outputs, first innovations column, free); absent blocks have length zero. `terms`: regressors,
-    -1 behind the last; `place`: output, and 1 for a denominator.
+    -1 behind the last; `place`: output.
     """
     lag, p, n_e, free = shape[0], shape[1], shape[2], shape[3]
     n, D, h, Q = z.shape[0], column.size, b1.size, M.shape[0]
-    x, f, num, den = np.zeros(D), np.zeros(p), np.zeros(p), np.ones(p)
+    x, f = np.zeros(D), np.zeros(p)
     projected = np.zeros(Q)
     innovations = z.shape[1] > n_e
     recursive = free == 1
@@ -61,20 +61,14 @@ def run(
     for t in range(lag, n):
         for d in range(D):
             x[d] = z[t - back[d], column[d]]
-        num[:] = 0.0
-        den[:] = 1.0
+        f[:] = 0.0
         for k in range(place.shape[0]):
             v = theta[k]
             for j in range(terms.shape[1]):
                 if terms[k, j] < 0:
                     break
                 v *= x[terms[k, j]]
-            if place[k, 1] == 1:
-                den[place[k, 0]] += v
-            else:
-                num[place[k, 0]] += v
-        for o in range(p):
-            f[o] = num[o] / den[o]
+            f[place[k]] += v
         for i in range(h):
             v = b1[i]
             for d in range(W1.shape[1]):

@@ -61,13 +61,11 @@ class Block(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Terms:
-    """Sums of coefficient times product of regressors: numerators, over 1 + denominators if any, and then the only such
-    block.
-    """
+    """Sums of coefficient times product of regressors."""
 
     n_outputs: int
     terms: Table  # (n_terms, most factors), places of regressors, -1 behind the last
-    place: Table  # (n_terms, 2), output, and 1 for the denominator
+    place: Table  # (n_terms,), output
 
     @property
     def n_theta(self) -> int:
@@ -75,14 +73,9 @@ class Terms:
         return int(self.place.shape[0])
 
     @cached_property
-    def _owned(self) -> tuple[tuple[slice | Table, slice | Table], ...]:
-        """Where numerator and denominator of each output stand in theta."""
-        places = [[np.flatnonzero(np.all(self.place == (o, b), axis=1)) for b in (0, 1)] for o in range(self.n_outputs)]
-        return tuple((_as_slice(up), _as_slice(down)) for up, down in places)
-
-    @cached_property
-    def _rational(self) -> bool:
-        return bool(np.any(self.place[:, 1]))
+    def _owned(self) -> tuple[slice | Table, ...]:
+        """Where the terms of each output stand in theta."""
+        return tuple(_as_slice(np.flatnonzero(self.place == o)) for o in range(self.n_outputs))
 
     @cached_property
     def _holds(self) -> dict[int, list[tuple[int, int, list[int]]]]:
@@ -103,7 +96,7 @@ class Terms:
     def bends(self, at: Table) -> bool:
         """As `Block.bends`."""
         inside = np.isin(self.terms, at)
-        return bool(np.any(inside.sum(axis=1) > 1) or np.any(inside[self.place[:, 1] == 1]))
+        return bool(np.any(inside.sum(axis=1) > 1))
 
     def prepare(self, x: Array) -> tuple[Array, ...]:
         """As `Block.prepare`."""
@@ -114,45 +107,29 @@ class Terms:
                 row *= columns[v]
         return np.ascontiguousarray(out.T), x
 
-    def _numerators(self, theta: Array, T: Array) -> Array:
-        out = np.empty((T.shape[0], self.n_outputs), dtype=theta.dtype)
-        for o, (up, _) in enumerate(self._owned):
-            out[:, o] = T[:, up] @ theta[up]
-        return out
-
-    def denominators(self, theta: Array, rows: tuple[Array, ...]) -> Array:
-        """Return the denominators' values, ones without, shape (n, n_outputs)."""
-        T, out = rows[0], np.ones((rows[0].shape[0], self.n_outputs))
-        for o, (_, down) in enumerate(self._owned):
-            out[:, o] += T[:, down] @ theta[down]
-        return out
-
     def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
         """As `Block.values`."""
-        numerators = self._numerators(theta, rows[0])
-        return numerators / self.denominators(theta, rows) if self._rational else numerators
+        T = rows[0]
+        out = np.empty((T.shape[0], self.n_outputs), dtype=theta.dtype)
+        for o, own in enumerate(self._owned):
+            out[:, o] = T[:, own] @ theta[own]
+        return out
 
     def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
         """As `Block.derivatives`."""
         T, x = rows
         n, p = T.shape[0], self.n_outputs
-        by_value = np.ones((1, p, 2))  # slopes by numerator and denominator
-        if self._rational:
-            num, den = self._numerators(theta, T), self.denominators(theta, rows)
-            by_value = np.stack([1.0 / den, -num / den**2], axis=2)
         out = np.zeros((n, p, self.n_theta if np.any(live) else 0))
-        for o, both in enumerate(self._owned if np.any(live) else ()):
-            for below, own in enumerate(both):
-                out[:, o, own] = T[:, own] * by_value[:, o, below, None]
-        varies = self._rational or any(rest for v in at for _, _, rest in self._holds.get(int(v), ()))
+        for o, own in enumerate(self._owned if np.any(live) else ()):
+            out[:, o, own] = T[:, own]
+        varies = any(rest for v in at for _, _, rest in self._holds.get(int(v), ()))
         by_x = np.zeros((n if varies else 1, p, at.size))
         for j, v in enumerate(at):
             for k, times, rest in self._holds.get(int(v), ()):
-                o, below = self.place[k]
-                slope = theta[k] * times * by_value[:, o, below]
+                slope = theta[k] * times
                 for w in rest:
                     slope = slope * x[:, w]
-                by_x[:, o, j] += slope
+                by_x[:, self.place[k], j] += slope
         return out if np.all(live) else out[:, :, live[: out.shape[2]]], by_x
 
     def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
@@ -183,7 +160,7 @@ class Linear(Terms):
         each = [*range(at.start, at.stop)]
         terms = each * n_outputs + [-1] * (n_outputs * constant)
         outputs = [o for o in range(n_outputs) for _ in each] + [*range(n_outputs)] * constant
-        place = np.array([(o, 0) for o in outputs], dtype=np.int64).reshape(-1, 2)
+        place = np.array(outputs, dtype=np.int64)
         table = np.array(terms, dtype=np.int64).reshape(-1, 1)
         return cls(n_outputs=n_outputs, terms=table, place=place, width=len(each))
 
@@ -588,7 +565,7 @@ class LaggedFunction(ABC):
         p, none = self.n_outputs, np.zeros((0, 0))
         numbers: dict[str, Any] = {
             "terms": np.zeros((0, 0), dtype=np.int64),
-            "place": np.zeros((0, 2), dtype=np.int64), "theta": np.zeros(0), "W2": none, "W1": none, "b1": np.zeros(0),
+            "place": np.zeros(0, dtype=np.int64), "theta": np.zeros(0), "W2": none, "W1": none, "b1": np.zeros(0),
             "W": none, "M": none, "C": none, "s": np.zeros(0),
         }  # fmt: skip
         for block, own in zip(self.blocks, self.split(theta), strict=True):

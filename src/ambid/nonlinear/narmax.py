@@ -28,7 +28,6 @@ from ambid.nonlinear.narmax_choice import (
     process_terms,
     prune_by_prediction,
     prune_by_simulation,
-    rational_terms,
     samples,
 )
 from ambid.nonlinear.polynomial import PolynomialFunction, term_name
@@ -38,7 +37,6 @@ _CLEAR = 10.0  # of the information criterion, which all candidates have to gain
 _MOST_AT_ONCE = 60  # candidates of an output: searches and prunings of more take minutes
 _PRUNINGS = 6
 _ITERATIONS, _ROUGHLY = 60, 12  # of a search at most; of one between, with terms too many, which creeps
-_NEAR_ZERO = 0.05  # part of a denominator's largest value
 DIVERGED = "no finite one-step predictor was found; lower ne, degree or terms, or check the columns"
 
 
@@ -54,7 +52,7 @@ class _Fitting(Draft[PolynomialFunction]):
 
 
 def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Identify a polynomial or rational NARMAX model, y(t) = b/a + e(t) (thesis eqs 3.1-3.4), not random; consistent
+    """Identify a polynomial NARMAX model (thesis eqs 3.1-3.4), not random; consistent
     under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``.
     """
     if not records:
@@ -88,7 +86,7 @@ def _fit_terms(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | 
     by_ratio, every = replace(s, selection="frols"), replace(s, selection="all")
     first = process_terms(by_ratio, parts, None)
     few = first.n_candidates <= min(_MOST_AT_ONCE, samples(parts, s.lag) // 20)  # all can be in a model at once
-    if not (few and s.kind == "polynomial" and is_sampled_fast(first)):
+    if not (few and is_sampled_fast(first)):
         _run_stages(by_ratio, parts, fitting, tick)
         return
     _run_stages(by_ratio, parts, fitting, part_of(tick, 0.0, 0.2))
@@ -111,13 +109,9 @@ def _fit_terms(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | 
 def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | None) -> None:
     """All stages, one after the other; their shares of the time are a guess, right within a factor of some."""
     free = s.focus == "simulation"
-    costs = (0.2, 1.5 * (s.kind == "rational"), 1.0 * bool(s.ne), 1.5, 1.0 * free)
-    choosing, below, noise, pruning, last = portions(tick, costs)
+    choosing, noise, pruning, last = portions(tick, (0.2, 1.0 * bool(s.ne), 1.5, 1.0 * free))
     began = perf_counter()
     choice = process_terms(s, parts, choosing)
-    if s.kind == "rational":
-        choice = rational_terms(s, choice, parts, part_of(below, 0.0, 0.5))
-        choice = _search(parts, choice, fitting, part_of(below, 0.5, 1.0))
     _keep(fitting, parts, choice)
     began = fitting.timed("terms", began)
     if s.ne:
@@ -155,7 +149,7 @@ def _search(
     parts: Parts, choice: Choice, fitting: _Fitting, tick: Tick | None, *, free: bool = False, most: int = _ITERATIONS
 ) -> Choice:
     """Search for coefficients; a model that is linear in them and has no innovations is where it should be already."""
-    if not free and not np.any(choice.function.noisy) and not choice.function.is_rational:
+    if not free and not np.any(choice.function.noisy):
         _keep(fitting, parts, choice)
         return choice
     weight = _weight(choice, parts, free=free)
@@ -222,19 +216,13 @@ def _finish(s: NarmaxSettings, fitting: _Fitting) -> NonlinearFit:
         first.outputs[o]: [
             {"term": term_name(x, function.n_outputs, function.m), "err": fitting.choice.err.get((o, x))} for x in own
         ]
-        for o, own in enumerate(function.numerators)
+        for o, own in enumerate(function.terms)
     }
     fitting.details = {
         "terms": terms, "candidates": fitting.choice.n_candidates, "passes": fitting.choice.passes,
         "levels": fitting.data.levels(first),
     }  # fmt: skip
     fitting.settings["focus"] = "simulation" if fitting.free else "prediction"
-    for rows in problem.rows() if function.is_rational else ():
-        below = function.terms_block.denominators(theta, function.predict(theta, rows)[1].prepared[0])
-        if np.any(np.min(below, axis=0) < _NEAR_ZERO * np.max(np.abs(below), axis=0)):
-            near_zero = "a denominator comes near zero on the training data: predictions there are unreliable"
-            fitting.warnings.append(near_zero)
-            break
     return finish(
         fitting, problem, posterior, units="terms", noise=s.ne > 0 and not fitting.free,
         instead="Give focus = prediction" if fitting.free else "Raise ne",

@@ -1,8 +1,7 @@
-"""Which terms a NARMAX model has: process terms, denominators, noise terms, and which of them can go again.
+"""Which terms a NARMAX model has: process terms, noise terms, and which of them can go again.
 
-Process terms come by orthogonal least squares; denominators with numerators from the equation multiplied out (thesis
-eq. 3.3), a prediction in place of y(t), whose noise would bias it (Billings and Zhu 1991); noise terms by extended
-least squares, process terms held (Billings 2013, sec. 3.5). A term goes, others readjusted along the linearised
+Process terms come by orthogonal least squares; noise terms by extended least squares, process terms held (Billings
+2013, sec. 3.5). A term goes, others readjusted along the linearised
 problem (exact for NARX), if a criterion gains by predictions, or the free run does not pay: what predicts well may
 spoil a run.
 """
@@ -25,7 +24,6 @@ from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
 from ambid.nonlinear.polynomial import (
     Candidates,
     Factor,
-    MatrixCandidates,
     PolynomialFunction,
     Selection,
     Term,
@@ -38,7 +36,6 @@ from ambid.nonlinear.records import Parts
 
 _ENOUGH = 1e-3  # gain, in the errors' variance, that ends a search: a step of 0.03 standard deviations
 _NEARLY_ALL = 0.99  # of the output's energy
-_RATIONAL_ROUNDS = 4
 _LONG = 20  # lags of the model whose errors begin
 _LESS = 0.95  # part of the errors' variance that it must leave
 _ROUNDS = 12  # of extended least squares
@@ -67,7 +64,6 @@ class NarmaxSettings:
         "criterion that removes terms again: prediction, simulation, none; prediction",
         *("prediction", "simulation", "none"),
     )
-    kind: str = choice("polynomial or rational; polynomial", "polynomial", "rational")
     selection: str = choice(
         "frols (by ratios), all (every candidate), auto (frols; all if a plant is sampled so fast that the ratios "
         "say little, and all predict better); auto",
@@ -108,14 +104,13 @@ class Choice:
         """Return the same terms with other coefficients."""
         return replace(self, theta=theta)
 
-    def with_numerators(self, numerators: list[tuple[Term, ...]], coefficients: list[Array]) -> Choice:
-        """Return other numerators over the same denominators, coefficients by output."""
-        both = [x for o, c in enumerate(coefficients) for x in (c, self.coefficients(o, 1))]
-        return replace(self, function=replace(self.function, numerators=tuple(numerators)), theta=np.concatenate(both))
+    def with_terms(self, terms: list[tuple[Term, ...]], coefficients: list[Array]) -> Choice:
+        """Return other terms with coefficients, by output."""
+        return replace(self, function=replace(self.function, terms=tuple(terms)), theta=np.concatenate(coefficients))
 
-    def coefficients(self, output: int, below: int = 0) -> Array:
-        """Return the coefficients of an output's numerator, or of its denominator."""
-        return self.theta[[(o, b) == (output, below) for o, b, _ in self.function.owned]]
+    def coefficients(self, output: int) -> Array:
+        """Return the coefficients of an output."""
+        return self.theta[[o == output for o, _ in self.function.owned]]
 
     def without(self, k: int, theta: Array) -> Choice:
         """Return a choice without term k; `theta` is of those that stay."""
@@ -183,7 +178,7 @@ def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Choice:
         num.append(tuple(terms[k] for k in picks))
         theta.append(least_squares(rows.columns(picks), target))
         passes = max(passes, chosen.passes)
-    function = PolynomialFunction(numerators=tuple(num), denominators=((),) * p, m=m)
+    function = PolynomialFunction(terms=tuple(num), m=m)
     return Choice(function=function, theta=np.concatenate(theta), err=err, n_candidates=len(terms), passes=passes)
 
 
@@ -198,43 +193,11 @@ def is_sampled_fast(model: Choice) -> bool:
     return any(x == (Factor("y", o, 1),) and ratio > _NEARLY_ALL for (o, x), ratio in model.err.items())
 
 
-def _choose(s: NarmaxSettings, pool: Candidates | MatrixCandidates, y: Array, tick: Tick | None) -> Selection:
+def _choose(s: NarmaxSettings, pool: Candidates, y: Array, tick: Tick | None) -> Selection:
     """Choose as the settings say."""
     most = len(pool.terms) if s.selection == "all" else min(s.terms, max(y.size // 5, 1))
     tell = None if tick is None else lambda done: tick("choice of terms", done)
     return select_terms(pool, y, most=most, criterion=s.criterion, tick=tell)
-
-
-def rational_terms(s: NarmaxSettings, polynomial: Choice, parts: Parts, tick: Tick | None) -> Choice:
-    """Choose numerators and denominators together; the predictions of a `polynomial` model begin the iteration."""
-    p, m = parts[0][0].shape[1], parts[0][1].shape[1]
-    up = process_candidates(s, p, m)
-    down = process_candidates(replace(s, constant=0), p, m)
-    both = (*up, *down)
-    P, D = (candidates(x, parts, s.lag).columns(range(len(x))) for x in (up, down))
-    owned: list[tuple[int, int, Term]] = []
-    theta, err, passes = [], {}, 1
-    for o, own in enumerate(polynomial.function.numerators):
-        target = np.concatenate([y[s.lag :, o] for y, _ in parts])
-        best, c = [(o, 0, x) for x in own], polynomial.coefficients(o)
-        yhat = candidates(own, parts, s.lag).columns(range(len(own))) @ c
-        for k in range(_RATIONAL_ROUNDS):
-            begin, each = (o * _RATIONAL_ROUNDS + k) / (p * _RATIONAL_ROUNDS), 1.0 / (p * _RATIONAL_ROUNDS)
-            matrix = np.hstack([P, -yhat[:, None] * D])
-            pick = _choose(s, MatrixCandidates(matrix=matrix), target, part_of(tick, begin, begin + each))
-            picks = np.array(sorted(pick.chosen, key=lambda k: k >= len(up)), dtype=np.int64)
-            trial, below = least_squares(matrix[:, picks], target), picks >= len(up)
-            divided = 1.0 + D[:, picks[below] - len(up)] @ trial[below]
-            if not (picks.size and np.all(divided > 1e-3)):
-                break
-            best, c = [(o, int(k >= len(up)), both[k]) for k in picks], trial
-            yhat = (P[:, picks[~below]] @ trial[~below]) / divided
-            err.update({(o, up[k]): float(x) for k, x in zip(pick.chosen, pick.err, strict=False) if k < len(up)})
-            passes = max(passes, pick.passes)
-        owned += best
-        theta.append(c)
-    function = polynomial.function.with_terms(owned)
-    return Choice(function=function, theta=np.concatenate(theta), err=err, n_candidates=len(both), passes=passes)
 
 
 # --- noise terms ------------------------------------------------------------------------------------------------------
@@ -248,29 +211,23 @@ def add_noise_terms(s: NarmaxSettings, process: Choice, parts: Parts, tick: Tick
     if not extra or errors is None:
         return process
     errors = _innovations_of_long_model(process, parts, errors)
-    own, last, best = process.function.numerators, process.theta, process
+    own, last, best = process.function.terms, process.theta, process
     chosen: list[tuple[Term, ...]] = [()] * p
     targets = [np.concatenate([y[s.lag :, o] for y, _ in parts]) for o in range(p)]
-    over: list[tuple[Array, ...] | None] = [None] * p  # one over the denominators in each record, where there are any
-    for o, below in enumerate(process.function.denominators):
-        if below:
-            rows = candidates(below, parts, s.lag)
-            values = 1.0 + rows.columns(range(len(below))) @ process.coefficients(o, 1)
-            over[o] = tuple(np.split(1.0 / values, np.cumsum(rows.rows)[:-1]))
     for rounds in range(_ROUNDS):
         if tick is not None:
             tick("extended least squares", guessed(rounds, _USUAL_ROUNDS))
         num, theta = [], []
         for o in range(p):
             if rounds < _CHOOSING:  # process terms are in the regression, not in the choice
-                rows, first = candidates((*own[o], *extra), parts, s.lag, errors, over[o]), range(len(own[o]))
+                rows, first = candidates((*own[o], *extra), parts, s.lag, errors), range(len(own[o]))
                 most = len(first) + s.terms
                 selection = select_terms(rows, targets[o], most=most, criterion=s.criterion, first=first)
                 chosen[o] = tuple(rows.terms[k] for k in selection.chosen if k >= len(first))
             num.append((*own[o], *chosen[o]))
-            rows = candidates(num[o], parts, s.lag, errors, over[o])
+            rows = candidates(num[o], parts, s.lag, errors)
             theta.append(least_squares(rows.columns(range(len(num[o]))), targets[o]))
-        trial = process.with_numerators(num, theta)
+        trial = process.with_terms(num, theta)
         fresh = innovations(trial, parts)
         if fresh is None:
             return best
@@ -288,15 +245,15 @@ def _innovations_of_long_model(process: Choice, parts: Parts, errors: list[Array
     """
     n, function = min(int(y.shape[0]) for y, _ in parts), process.function
     most = min(_LONG, n // (10 * (function.n_outputs + function.m)))
-    if function.is_rational or most <= function.lag:
+    if most <= function.lag:
         return errors
     linear = [(f,) for f in lagged(function.n_outputs, function.m, ny=most, nu=most, nk=1)]
     num, theta = [], []
-    for o, terms in enumerate(function.numerators):
+    for o, terms in enumerate(function.terms):
         num.append((*terms, *(x for x in linear if x not in terms)))
         rows = candidates(num[o], parts, most)
         theta.append(least_squares(rows.columns(range(len(num[o]))), np.concatenate([y[most:, o] for y, _ in parts])))
-    improved = innovations(process.with_numerators(num, theta), parts)
+    improved = innovations(process.with_terms(num, theta), parts)
     if improved is None:
         return errors
     size = [np.mean(np.concatenate([x[most:] for x in e]) ** 2, axis=0) for e in (errors, improved)]
@@ -307,11 +264,11 @@ def add_all_noise(s: NarmaxSettings, model: Choice) -> Choice:
     """Return the choice with every innovation that it may have, those that are new at zero; the same if none is."""
     function = model.function
     extra = [(f,) for f in lagged(function.n_outputs, function.m, ny=0, nu=0, nk=1, ne=s.ne)]
-    more = [[x for x in extra if x not in terms] for terms in function.numerators]
+    more = [[x for x in extra if x not in terms] for terms in function.terms]
     if not any(more):
         return model
-    num = [(*terms, *new) for terms, new in zip(function.numerators, more, strict=True)]
-    return model.with_numerators(num, [np.append(model.coefficients(o), np.zeros(len(x))) for o, x in enumerate(more)])
+    num = [(*terms, *new) for terms, new in zip(function.terms, more, strict=True)]
+    return model.with_terms(num, [np.append(model.coefficients(o), np.zeros(len(x))) for o, x in enumerate(more)])
 
 
 def innovations(model: Choice, parts: Parts) -> list[Array] | None:
@@ -383,5 +340,5 @@ def _readjust(model: Choice, inverse: Array, k: int) -> Choice:
 def _may_go(model: Choice, *, noise: bool) -> np.ndarray:
     """Whether a term may be left out: an output keeps one term at least, innovations go only with `noise`."""
     function = model.function
-    alone = np.array([not below and len(function.numerators[o]) == 1 for o, below, _ in function.owned])
+    alone = np.array([len(function.terms[o]) == 1 for o, _ in function.owned])
     return np.asarray(~alone & (noise | ~function.noisy))

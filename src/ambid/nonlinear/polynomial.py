@@ -105,66 +105,53 @@ def column_of(f: Factor, n_outputs: int, n_inputs: int) -> int:
     return f.channel + {"y": 0, "u": n_outputs, "e": n_outputs + n_inputs}[f.kind]
 
 
-def block_of(x: Regressors, owned: Sequence[tuple[int, int, Term]]) -> Terms:
-    """Return terms of regressors as a block; `owned` are output, 1 for a denominator, term."""
+def block_of(x: Regressors, owned: Sequence[tuple[int, Term]]) -> Terms:
+    """Return terms of regressors as a block; `owned` are output and term."""
     where = {at: k for k, at in enumerate(zip(x.column.tolist(), x.back.tolist(), strict=True))}
-    rows = [[where[column_of(f, x.n_outputs, x.n_inputs), f.lag] for f in term] for _, _, term in owned]
+    rows = [[where[column_of(f, x.n_outputs, x.n_inputs), f.lag] for f in term] for _, term in owned]
     width = max(map(len, rows), default=0)
     table = np.array([v + [-1] * (width - len(v)) for v in rows], dtype=np.int64).reshape(len(rows), width)
-    place = np.array([(o, below) for o, below, _ in owned], dtype=np.int64).reshape(-1, 2)
+    place = np.array([o for o, _ in owned], dtype=np.int64)
     return Terms(n_outputs=x.n_outputs, terms=table, place=place)
 
 
-def unit_of(owned: Sequence[tuple[int, int, Term]], y_scale: Array, u_scale: Array) -> Array:
+def unit_of(owned: Sequence[tuple[int, Term]], y_scale: Array, u_scale: Array) -> Array:
     """Return what a scaled coefficient of 1 is in SI, shape (n_terms,)."""
     size = {"y": y_scale, "u": u_scale, "e": y_scale}
     return np.array(
-        [(1.0 if below else y_scale[o]) / np.prod([size[f.kind][f.channel] for f in x]) for o, below, x in owned],
+        [y_scale[o] / np.prod([size[f.kind][f.channel] for f in x]) for o, x in owned],
         dtype=np.float64,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolynomialFunction(LaggedFunction):
-    """yhat(t) = b / (1 + a), sums of coefficient times term (thesis eqs 3.1-3.4), by output, numerator first;
-    denominators empty for a polynomial.
-    """
+    """yhat(t), a sum of coefficient times term for each output (thesis eqs 3.1-3.4)."""
 
     kind: ClassVar[str] = "narmax"
     ellipsoid: ClassVar[bool] = True
-    numerators: tuple[tuple[Term, ...], ...]  # by output
-    denominators: tuple[tuple[Term, ...], ...]
+    terms: tuple[tuple[Term, ...], ...]  # by output
     m: int  # inputs
 
     @cached_property
-    def owned(self) -> tuple[tuple[int, int, Term], ...]:
-        """Output, 1 for the denominator, and term of each coefficient."""
-        both = enumerate(zip(self.numerators, self.denominators, strict=True))
-        return tuple((o, below, x) for o, pair in both for below, terms in enumerate(pair) for x in terms)
+    def owned(self) -> tuple[tuple[int, Term], ...]:
+        """Output and term of each coefficient."""
+        return tuple((o, x) for o, terms in enumerate(self.terms) for x in terms)
 
-    def with_terms(self, owned: Sequence[tuple[int, int, Term]]) -> Self:
+    def with_terms(self, owned: Sequence[tuple[int, Term]]) -> Self:
         """Return the same function of other terms, in the order of `owned`."""
-        num, den = (
-            tuple(tuple(x for q, b, x in owned if (q, b) == (o, below)) for o in range(len(self.numerators)))
-            for below in (0, 1)
-        )
-        return replace(self, numerators=num, denominators=den)
-
-    @cached_property
-    def is_rational(self) -> bool:
-        """Whether there is a denominator."""
-        return any(self.denominators)
+        return replace(self, terms=tuple(tuple(x for q, x in owned if q == o) for o in range(len(self.terms))))
 
     @cached_property
     def noisy(self) -> Mask:
         """Which terms hold an innovation."""
-        return np.array([is_noisy(x) for _, _, x in self.owned], dtype=np.bool_)
+        return np.array([is_noisy(x) for _, x in self.owned], dtype=np.bool_)
 
     @cached_property
     def regressors(self) -> Regressors:
         """What its terms look at."""
-        p = len(self.numerators)
-        factors = dict.fromkeys(f for _, _, x in self.owned for f in x)
+        p = len(self.terms)
+        factors = dict.fromkeys(f for _, x in self.owned for f in x)
         column = np.array([column_of(f, p, self.m) for f in factors], dtype=np.int64)
         back = np.array([f.lag for f in factors], dtype=np.int64)
         return Regressors(n_outputs=p, n_inputs=self.m, column=column, back=back)
@@ -181,10 +168,9 @@ class PolynomialFunction(LaggedFunction):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the coefficients: their terms; denominators in the form ``1/(...)``."""
-        p, channel = len(self.numerators), channel_names("y", len(self.numerators))
-        names = [(o, below, term_name(x, p, self.m)) for o, below, x in self.owned]
-        return tuple((f"{channel[o]}: " if p > 1 else "") + (f"1/({x})" if below else x) for o, below, x in names)
+        """Of the coefficients: their terms."""
+        p, channel = len(self.terms), channel_names("y", len(self.terms))
+        return tuple((f"{channel[o]}: " if p > 1 else "") + term_name(x, p, self.m) for o, x in self.owned)
 
     def unit(self, y_scale: Array, u_scale: Array) -> Array:
         """As `LaggedFunction.unit`: coefficients are in SI."""
@@ -192,20 +178,15 @@ class PolynomialFunction(LaggedFunction):
 
     def as_json(self) -> dict[str, Any]:
         """As `LaggedFunction.as_json`."""
-        return {
-            "n_inputs": self.m,
-            "numerators": terms_to_json(self.numerators),
-            "denominators": terms_to_json(self.denominators),
-        }
+        return {"n_inputs": self.m, "numerators": terms_to_json(self.terms)}
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
         """Read it back."""
         p, m = len(document["numerators"]), int(document["n_inputs"])
-        num, den = (terms_from_json(document[k], p, m) for k in ("numerators", "denominators"))
-        if document.get("output", "signed") != "signed":
-            raise ValueError("it is of a sensor without sign")
-        return cls(numerators=num, denominators=den, m=m)
+        if any(document.get("denominators", ())) or document.get("output", "signed") != "signed":
+            raise ValueError("it is rational, or of a sensor without sign")
+        return cls(terms=terms_from_json(document["numerators"], p, m), m=m)
 
 
 _BLOCK = 4096  # rows at a time: a block of some hundred candidates stays in the cache of the second level
@@ -223,8 +204,6 @@ class Candidates:
     terms: tuple[Term, ...]
     parts: tuple[dict[Factor, Array], ...]  # (n_rows of the record,), lagged signals of each record
     rows: tuple[int, ...]  # of each record
-    # (n_rows of the record,), or None, what every value of a row is multiplied with
-    weight: tuple[Array, ...] | None = None
 
     @property
     def n_rows(self) -> int:
@@ -235,15 +214,13 @@ class Candidates:
         """Yield rows block by block, and the values there, contiguous (n_which, n_rows), of some candidates, or all."""
         terms = self.terms if which is None else [self.terms[k] for k in which]
         size, start = max(_BLOCK, 1), 0
-        for r, (n, signals) in enumerate(zip(self.rows, self.parts, strict=True)):
+        for n, signals in zip(self.rows, self.parts, strict=True):
             for first in range(0, n, size):
                 last = min(first + size, n)
                 out = np.ones((len(terms), last - first))
                 for product, term in zip(out, terms, strict=True):
                     for f in term:
                         product *= signals[f][first:last]
-                if self.weight is not None:
-                    out *= self.weight[r][first:last]
                 yield slice(start + first, start + last), out
             start += n
 
@@ -260,9 +237,8 @@ def candidates(
     records: Sequence[tuple[Array, Array]],
     lag: int,
     innovations: Sequence[Array] | None = None,
-    weight: tuple[Array, ...] | None = None,
 ) -> Candidates:
-    """Return the candidates over several records, rows from sample `lag` of each on; `weight` multiplies each row."""
+    """Return the candidates over several records, rows from sample `lag` of each on."""
     factors = sorted({f for t in terms for f in t})
     parts = []
     for r, (y, u) in enumerate(records):
@@ -273,35 +249,7 @@ def candidates(
             {f: np.ascontiguousarray(kinds[f.kind][lag - f.lag : max(n - f.lag, 0), f.channel]) for f in factors}
         )
     rows = tuple(max(y.shape[0] - lag, 0) for y, _ in records)
-    return Candidates(terms=tuple(terms), parts=tuple(parts), rows=rows, weight=weight)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MatrixCandidates:
-    """Candidates that exist as a matrix already."""
-
-    matrix: Array  # (n_rows, n_candidates)
-
-    @property
-    def n_rows(self) -> int:
-        """Rows."""
-        return int(self.matrix.shape[0])
-
-    @property
-    def terms(self) -> range:
-        """Numbers of the candidates."""
-        return range(self.matrix.shape[1])
-
-    def blocks(self, which: Sequence[int] | None = None) -> Iterator[tuple[slice, Array]]:
-        """As `Candidates.blocks`."""
-        chosen = self.matrix if which is None else self.matrix[:, list(which)]
-        for first in range(0, self.n_rows, _BLOCK):
-            last = min(first + _BLOCK, self.n_rows)
-            yield slice(first, last), np.array(chosen[first:last].T, order="C")
-
-    def columns(self, which: Sequence[int]) -> Array:
-        """Return some candidates whole, shape (n_rows, n_which)."""
-        return self.matrix[:, list(which)]
+    return Candidates(terms=tuple(terms), parts=tuple(parts), rows=rows)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -323,7 +271,7 @@ class Selection:
 
 
 def select_terms(
-    pool: Candidates | MatrixCandidates,
+    pool: Candidates,
     y: Array,
     *,
     most: int,
@@ -335,7 +283,7 @@ def select_terms(
 
     Parameters
     ----------
-    pool : Candidates or MatrixCandidates
+    pool : Candidates
         The regressors.
     y : ndarray, shape (n_rows,)
         What they have to explain.
@@ -383,7 +331,7 @@ def select_terms(
 class _Gram:
     """Scalar products of what is left of candidates and output, orthogonal to those chosen so far."""
 
-    def __init__(self, pool: Candidates | MatrixCandidates, y: Array, tick: Callable[[float], object] | None) -> None:
+    def __init__(self, pool: Candidates, y: Array, tick: Callable[[float], object] | None) -> None:
         self.found, self.y, self.tick = pool, y, tick
         self.order: list[int] = []
         self.path: list[float] = []

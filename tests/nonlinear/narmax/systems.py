@@ -28,15 +28,6 @@ def polynomial(n: int, seed: int, *, c: float = 0.6, noise: float = 0.1) -> IODa
     return record(u, y)
 
 
-def rational(n: int, seed: int, *, noise: float = 0.02, colour: float = 0.0) -> IOData:
-    """y(t) = (0.4 y(t-1) + u(t-1) + colour e(t-1)) / (1 + 0.5 y(t-1)^2) + e(t)."""
-    rng = np.random.default_rng(seed)
-    u, y, e = rng.uniform(-1.5, 1.5, n), np.zeros(n), noise * rng.standard_normal(n)
-    for t in range(1, n):
-        y[t] = (0.4 * y[t - 1] + u[t - 1] + colour * e[t - 1]) / (1 + 0.5 * y[t - 1] ** 2) + e[t]
-    return record(u, y)
-
-
 def coefficients(fit: NonlinearFit) -> dict[str, tuple[float, float]]:
     """Value and standard deviation by term."""
     assert fit.model is not None

@@ -11,8 +11,7 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.lagged import LaggedModel
 from ambid.nonlinear.narmax import narmax
-from ambid.nonlinear.polynomial import PolynomialFunction
-from tests.nonlinear.narmax.systems import TRUTH, coefficients, polynomial, rational, record
+from tests.nonlinear.narmax.systems import TRUTH, coefficients, polynomial, record
 from tests.tiers import runs
 
 
@@ -51,37 +50,6 @@ def test_innovations_are_the_one_step_errors_and_white() -> None:
     assert np.var(e) == pytest.approx(found.noise_covariance[0, 0], rel=1e-2)
     r = np.array([np.mean(e[k:] * e[:-k]) for k in range(1, 11)]) / np.var(e)
     assert np.sum(r**2) * e.size < 29.6  # chi2(10), 0.1 %
-
-
-def test_jacobian_with_innovations_and_denominators_is_exact() -> None:
-    data = rational(300, 2, colour=0.7)
-    found = narmax([data], {"kind": "rational", "ne": 1, "criterion": "bic", "pruning": "none", "ny": 1, "nu": 1})
-    model = found.model
-    assert isinstance(model, LaggedModel)
-    assert isinstance(model.function, PolynomialFunction)
-    assert model.function.is_rational
-    assert any("e(" in name for name in model.names)
-    J = model.jacobian(data.u, data.y)
-    for k in range(model.theta.size):
-        h = 1e-6 * max(abs(model.theta[k]), 1e-2)
-        up, down = model.theta.copy(), model.theta.copy()
-        up[k] += h
-        down[k] -= h
-        slope = (model.with_theta(up).predict(data.u, data.y) - model.with_theta(down).predict(data.u, data.y))[
-            model.lag :
-        ] / (2 * h)
-        np.testing.assert_allclose(J[model.lag :, :, k], slope, atol=1e-6 * max(1.0, np.abs(slope).max()))
-
-
-def test_rational_system_comes_back() -> None:
-    found = narmax([rational(3000, 0)], {"kind": "rational", "ny": 2, "nu": 2, "ne": 1})
-    values = coefficients(found)
-    assert set(values) == {"y(t-1)", "u(t-1)", "1/(y(t-1)^2)"}
-    for name, truth in {"y(t-1)": 0.4, "u(t-1)": 1.0, "1/(y(t-1)^2)": 0.5}.items():
-        value, sd = values[name]
-        assert abs(value - truth) < 4.5 * sd
-        assert sd < 0.02
-    assert found.noise_covariance[0, 0] == pytest.approx(4e-4, rel=0.15)
 
 
 def loop(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

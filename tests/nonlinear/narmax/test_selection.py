@@ -7,8 +7,9 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.uncertainty import CRITERIA, information, penalty
-from ambid.nonlinear.polynomial import MatrixCandidates, candidates, lagged, products, select_terms, term_name
+from ambid.nonlinear.polynomial import candidates, lagged, products, select_terms, term_name
 from tests.nonlinear.narmax.systems import polynomial
+from tests.nonlinear.systems import MatrixCandidates
 
 
 def plain(P: np.ndarray, y: np.ndarray, most: int) -> tuple[list[int], list[float]]:
@@ -42,7 +43,7 @@ def regression(n: int = 700, degree: int = 3) -> tuple[np.ndarray, np.ndarray, t
 def test_the_choice_is_that_of_plain_orthogonalisation() -> None:
     P, y, _ = regression()
     order, err = plain(P, y, 20)
-    found = select_terms(MatrixCandidates(matrix=P), y, most=20)
+    found = select_terms(MatrixCandidates(P), y, most=20)
     assert list(found.order) == order
     np.testing.assert_allclose(found.err, err, rtol=1e-8)
     np.testing.assert_allclose(found.left[1:], 1 - np.cumsum(err), rtol=1e-6)
@@ -51,7 +52,7 @@ def test_the_choice_is_that_of_plain_orthogonalisation() -> None:
 
 def test_true_terms_are_chosen() -> None:
     P, y, terms = regression()
-    found = select_terms(MatrixCandidates(matrix=P), y, most=20)
+    found = select_terms(MatrixCandidates(P), y, most=20)
     names = {term_name(terms[k], 1, 1) for k in found.chosen}
     assert names >= {"y(t-1)", "y(t-2)", "u(t-1)*y(t-1)", "u(t-2)", "u(t-1)^2"}
     assert len(names) <= 10  # a forward choice may take a product of the equation with a polynomial in q^-1
@@ -62,7 +63,7 @@ def test_candidates_that_are_nearly_alike_are_told_apart_by_further_passes() -> 
     x = 10 + 0.01 * rng.standard_normal((2000, 1))
     P = np.hstack([x**k for k in range(5)])
     y = P @ np.array([1.0, -2.0, 0.5, 0.1, 0.0]) + 1e-6 * rng.standard_normal(2000)
-    found = select_terms(MatrixCandidates(matrix=P), y, most=3, criterion="bic")
+    found = select_terms(MatrixCandidates(P), y, most=3, criterion="bic")
     order, err = plain(P, y, 3)
     assert found.passes > 1
     assert list(found.order[:2]) == order[:2]
@@ -73,7 +74,7 @@ def test_without_noise_the_rest_is_rounding_and_the_choice_ends() -> None:
     P, _, _ = regression()
     theta = np.zeros(P.shape[1])
     theta[[1, 5, 30]] = [1.0, -0.5, 1e-5]
-    found = select_terms(MatrixCandidates(matrix=P), P @ theta, most=20, criterion="bic")
+    found = select_terms(MatrixCandidates(P), P @ theta, most=20, criterion="bic")
     assert set(found.order[:3]) >= {1, 5, 30} or set(found.chosen) >= {1, 5, 30}
     assert found.left[-1] < 1e-20
 
@@ -81,13 +82,13 @@ def test_without_noise_the_rest_is_rounding_and_the_choice_ends() -> None:
 def test_copies_of_a_candidate_are_left_out() -> None:
     P, y, _ = regression(degree=1)
     twice = np.hstack([P, P, 2 * P])
-    found = select_terms(MatrixCandidates(matrix=twice), y, most=30, criterion="aic")
+    found = select_terms(MatrixCandidates(twice), y, most=30, criterion="aic")
     assert len({k % P.shape[1] for k in found.order}) == len(found.order) <= P.shape[1]
 
 
 def test_candidates_given_first_stay_in() -> None:
     P, y, _ = regression()
-    found = select_terms(MatrixCandidates(matrix=P), y, most=10, first=[40, 41])
+    found = select_terms(MatrixCandidates(P), y, most=10, first=[40, 41])
     assert found.chosen[:2] == (40, 41)
 
 
@@ -97,7 +98,7 @@ def test_the_matrix_is_not_changed_and_blocks_do_not_matter() -> None:
     rows = candidates(terms, [(data.y[:5000], data.u[:5000]), (data.y[5000:], data.u[5000:])], 2)
     P = np.asfortranarray(rows.columns(range(len(terms))))
     before, y = P.copy(), np.concatenate([data.y[2:5000, 0], data.y[5002:, 0]])
-    whole, blocks = select_terms(MatrixCandidates(matrix=P), y, most=8), select_terms(rows, y, most=8)
+    whole, blocks = select_terms(MatrixCandidates(P), y, most=8), select_terms(rows, y, most=8)
     np.testing.assert_array_equal(P, before)
     assert whole.order == blocks.order
     np.testing.assert_allclose(whole.err, blocks.err, rtol=1e-10)
@@ -113,7 +114,7 @@ def test_criteria_weigh_terms_against_errors(criterion: str) -> None:
 def test_an_unknown_criterion_is_refused() -> None:
     P, y, _ = regression(degree=1)
     with pytest.raises(EstimationError, match="ebic"):
-        select_terms(MatrixCandidates(matrix=P), y, most=3, criterion="ebik")
+        select_terms(MatrixCandidates(P), y, most=3, criterion="ebik")
 
 
 def test_no_criterion_makes_a_term_cheaper_than_none() -> None:

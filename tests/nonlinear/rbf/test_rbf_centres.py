@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.nonlinear.polynomial import MatrixCandidates, select_terms
+from ambid.nonlinear.polynomial import select_terms
 from ambid.nonlinear.rbf import ols_order, typical_size
+from tests.nonlinear.systems import MatrixCandidates
 
 
 def left(columns: np.ndarray, y: np.ndarray) -> float:
@@ -41,7 +42,7 @@ def test_the_order_is_that_of_the_terms_of_a_difference_equation() -> None:
     candidates, y = rng.standard_normal((200, 15)), rng.standard_normal(200)
     y += candidates[:, 3] - 0.5 * candidates[:, 8]
     order = ols_order(candidates, np.zeros((200, 1)), y[:, None], 6)
-    assert tuple(order) == select_terms(MatrixCandidates(matrix=candidates), y, most=6).order
+    assert tuple(order) == select_terms(MatrixCandidates(candidates), y, most=6).order
 
 
 def test_what_the_model_holds_already_is_not_taken_again() -> None:
