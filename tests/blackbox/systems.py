@@ -27,7 +27,6 @@ _OWN = {
     "bj": {"nd": 2},
     "ararx": {"nd": 5},
     "arma": {},
-    "clsrivc": {"nk": 0},
     "blocks": {"nk": 0},
 }
 

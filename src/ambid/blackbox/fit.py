@@ -101,8 +101,6 @@ STRUCTURES = _register(
     ("iv4", "polynomial", "instrumental", "na nb nk", "biased", "A y = B u + noise of any colour"),
     ("cliv", "polynomial", "instrumental", "na nb nk", "consistent",
      "A y = B u + noise of any colour, in closed loop with its reference"),
-    ("clsrivc", "transfer function", "instrumental_continuous", "nb nf nk", "consistent",
-     "y = B(s)/F(s) u + noise, continuous time, in closed loop with its reference"),
     ("n4sid", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace by oblique projection"),
     ("moesp", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace, past without future inputs"),
     ("cva", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace by canonical variates"),

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instrumental_continuous import clsrivc
+from ambid.blackbox.instrumental import cliv
 from ambid.blackbox.model import Offsets, StateSpaceModel, TransferModel
 from ambid.blackbox.polynomial import arma, armax, bj, oe
 from ambid.blackbox.prediction import errors, gradient, innovations_form, polynomial_gradient
@@ -132,7 +132,7 @@ def test_in_a_loop_an_output_error_model_is_judged_by_the_reference():
     plain = loop(seed=6, n=3000)
     reference = plain.u[:, 0] + 0.5 * plain.y[:, 0]
     data = io(plain.u, plain.y, reference=reference[:, None], references=("r0",))
-    fit = judge(clsrivc(data, {"nb": 2, "nf": 2}), data)
+    fit = judge(cliv(data, {"na": 2, "nb": 2}), data)
     assert fit.checks["residuals_uncorrelated"].passed
     assert fit.checks["feedback"].passed
     assert fit.checks["feedback"].values["seen"] == 1.0
@@ -279,7 +279,7 @@ def test_the_tangent_of_a_state_space_holds_the_change_of_every_entry():
 
 def by_hand(model, data) -> BlackBoxFit:
     return build_fit(
-        "n4sid" if isinstance(model, StateSpaceModel) else "clsrivc",
+        "n4sid" if isinstance(model, StateSpaceModel) else "blocks",
         data,
         orders={"n": 2},
         model=model,
