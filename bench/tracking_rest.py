@@ -41,8 +41,7 @@ class Rested:
 def estimators() -> dict[str, Callable[[], RecursiveEstimator]]:
     """Each with a memory of a second; they model the current from voltage and current before."""
     return {
-        "RLS(4), exponential forgetting": lambda: RecursiveLeastSquares(4, forgetting="exponential", memory=MEMORY),
-        "RLS(4), directional forgetting": lambda: RecursiveLeastSquares(4, forgetting="directional", memory=MEMORY),
+        "RLS(4), exponential forgetting": lambda: RecursiveLeastSquares(4, memory=MEMORY),
         "recursive ARMAX": lambda: RecursivePolynomial("armax", ORDERS, forgetting=1.0 - 1.0 / MEMORY),
     }
 

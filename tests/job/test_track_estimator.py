@@ -44,7 +44,6 @@ def last(found: Track) -> tuple[dict[str, float], dict[str, float]]:
         ("rls", {"memory": 2.0}),
         ("lms", {"step": 0.02}),
         ("nlms", {"step": 0.05}),
-        ("iv", {"open_loop": True}),
         ("arx", {}),
         ("armax", {"orders": ARX | {"nc": 1}}),
     ],
@@ -63,16 +62,12 @@ def test_coefficients_come_in_si_with_their_deviations(method: str, more: dict[s
     assert found.totals.samples + found.totals.rejected_samples == N
 
 
-def test_feedback_biases_and_is_told_unless_a_reference_is_the_instrument() -> None:
+def test_feedback_biases_and_is_told() -> None:
     record, settings = first_order(loop=True), {"input": "u", "output": "y", "orders": ARX}
     rls = track(record, method="rls", **settings)  # type: ignore[arg-type]
-    iv = track(record, method="iv", reference="r", **settings)  # type: ignore[arg-type]
     value, sd = last(rls)
     assert abs(value["a1"] - A1) > 5 * sd["a1"]
     assert "biased" in rls.header.warnings[0]
-    value, sd = last(iv)
-    assert abs(value["a1"] - A1) < 4 * sd["a1"]
-    assert not iv.header.warnings
 
 
 @pytest.mark.parametrize("method", ["ekf", "ukf"])
@@ -96,7 +91,6 @@ def test_joint_filters_follow_physical_parameters_from_an_identified_start(metho
         ("rls", {"orders": {"na": 1, "nb": 1, "nk": "auto"}}, "cannot choose it"),
         ("rls", {"step": 0.1}, "no step"),
         ("lms", {"memory": 1.0}, "no memory"),
-        ("iv", {}, "with reference"),
         ("armax", {"orders": None}, "needs orders"),
         ("rls", {"start": 1.0}, "no start"),
         ("ekf", {}, "no input"),

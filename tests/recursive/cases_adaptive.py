@@ -9,8 +9,6 @@ from ambid.recursive.regression import (
     Lms,
     Nlms,
     RecursiveArx,
-    RecursiveInstrumentalVariables,
-    RecursiveIvArx,
     RecursiveLeastSquares,
 )
 from tests.recursive.cases import Case
@@ -30,13 +28,6 @@ def three(n: int, seed: int) -> tuple[Array, Array]:
     """Three of the four."""
     phi, y = regression(n, seed)
     return phi[:, :3], y - 0.5
-
-
-def instruments(n: int, seed: int) -> tuple[Array, Array]:
-    """The three regressors and four instruments, noisy mixtures of them."""
-    phi, y = three(n, seed)
-    noise = np.random.default_rng([seed, 5]).normal(size=(n, 4))
-    return np.column_stack([phi, phi @ np.ones((3, 4)) + phi[:, [0, 1, 2, 0]] + noise]), y
 
 
 def loop(n: int, seed: int) -> tuple[Array, Array]:
@@ -65,25 +56,8 @@ CASES = [
     Case(name="rls-forgetting", make=lambda: RecursiveLeastSquares(4, memory=100), signals=regression),
     Case(name="rls-forgetting-3", make=lambda: RecursiveLeastSquares(3, factor=0.6), signals=three),
     Case(
-        name="rls-directional",
-        make=lambda: RecursiveLeastSquares(4, forgetting="directional", factor=0.98),
-        signals=regression,
-    ),
-    Case(name="iv", make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4), signals=instruments),
-    Case(
-        name="iv-forgetting",
-        make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4, memory=60, correlation=7),
-        signals=instruments,
-    ),
-    Case(
         name="arx-rls",
         make=lambda: RecursiveArx(2, 2, offset=True, estimator=lambda names: RecursiveLeastSquares(names, memory=80)),
-        signals=input_alone,
-    ),
-    Case(name="arx-iv-reference", make=lambda: RecursiveIvArx(2, 2, instruments="reference"), signals=loop),
-    Case(
-        name="arx-iv-auxiliary",
-        make=lambda: RecursiveIvArx(2, 2, instruments="auxiliary model", memory=100, offset=True),
         signals=input_alone,
     ),
 ]

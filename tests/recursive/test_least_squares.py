@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.regression import Forgetting, RecursiveLeastSquares
+from ambid.recursive.regression import RecursiveLeastSquares
 
 N = 300
 
@@ -49,38 +49,6 @@ def test_with_forgetting_the_error_is_smaller_than_the_matrix_by_one_plus_factor
     np.testing.assert_allclose(np.diag(rls.P) / np.diag(rls.covariance), 1.999, rtol=0.05)
 
 
-def test_directional_forgetting_is_that_of_cao_and_schwartz_and_its_covariance_that_of_the_error() -> None:
-    phi, y = data(4, 80)
-    rls = RecursiveLeastSquares(4, prior=2.0, forgetting="directional", factor=0.9, noise_sd=0.2, limit=1e9)
-    rls.update(phi, y)
-    theta, R, C = np.zeros(4), np.eye(4) / 2, 2 * np.eye(4)
-    for row, out in zip(phi, y, strict=True):
-        met = R @ row
-        R = R - 0.1 * np.outer(met, met) / (row @ met) + np.outer(row, row)
-        K = np.linalg.solve(R, row)
-        theta = theta + K * (out - row @ theta)
-        left = np.eye(4) - np.outer(K, row)
-        C = left @ C @ left.T + np.outer(K, K)
-    np.testing.assert_allclose(rls.estimate, theta, rtol=1e-8)
-    np.testing.assert_allclose(rls.P, np.linalg.inv(R), rtol=1e-7, atol=1e-10)
-    np.testing.assert_allclose(rls.covariance, 0.04 * C, rtol=1e-7, atol=1e-12)
-
-
-def test_directional_forgetting_keeps_what_is_not_excited_and_follows_what_is() -> None:
-    phi, y = data(4, 4000)
-    phi[:, 0] += 1.0
-    y = phi @ [1.0, 2.0, 3.0, 4.0]
-    y += 0.01 * np.random.default_rng(1).normal(size=y.size)
-    rls = RecursiveLeastSquares(4, forgetting="directional", factor=0.98)
-    rls.update(phi, y)
-    before = rls.P
-    only = np.zeros((20_000, 4))
-    only[:, 0] = phi[:, 0].mean()
-    rls.update(only, 5.0 * only[:, 0])
-    assert abs(rls.estimate[0] - 5.0) < 1e-6
-    assert (np.diag(rls.P)[1:] < 1.001 * np.diag(before)[1:]).all()
-
-
 def test_wind_up_ends_at_the_limit_and_the_estimate_stays() -> None:
     phi, y = data(4, 2000)
     rls = RecursiveLeastSquares(4, prior=2.0, memory=50, limit=10.0)
@@ -92,9 +60,7 @@ def test_wind_up_ends_at_the_limit_and_the_estimate_stays() -> None:
     np.testing.assert_allclose(rls.covariance, covariance, rtol=1e-6)  # silence says nothing of the error
 
 
-@pytest.mark.parametrize(
-    "settings", [{"memory": 1000.0}, {"factor": 0.3}, {"forgetting": "directional", "factor": 0.9}]
-)
+@pytest.mark.parametrize("settings", [{"memory": 1000.0}, {"factor": 0.3}])
 def test_ten_million_poor_updates_keep_the_covariance_sound(settings: dict[str, object]) -> None:
     """Regressors of 1e-9 to 1e6, bursts, collinear stretches and silence."""
     rng = np.random.default_rng(2)
@@ -159,9 +125,6 @@ def test_noise_is_found_from_few_samples_and_kept_in_silence() -> None:
         {"factor": 1.0},
         {"factor": 0.9, "memory": 10.0},
         {"memory": 0.5},
-        {"forgetting": "exponential"},
-        {"forgetting": "none", "memory": 10.0},
-        {"forgetting": "sudden", "memory": 10.0},
         {"prior": -1.0},
         {"prior": np.ones((4, 4))},
         {"prior": [1.0, 2.0]},
@@ -177,7 +140,7 @@ def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
         RecursiveLeastSquares(("a", "a"))
 
 
-@pytest.mark.parametrize("settings", [{}, {"memory": 500}, {"memory": 500, "forgetting": "directional"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"memory": 500}], ids=str)
 @pytest.mark.parametrize("size", [1e-7, 1e6])
 def test_without_a_prior_the_units_of_the_signals_do_not_matter(settings: dict[str, object], size: float) -> None:
     phi, y = data(4, 3000)
@@ -200,13 +163,12 @@ def test_silence_winds_up_to_a_limit_without_a_prior_too() -> None:
 
 
 @pytest.mark.parametrize("n", [4, 5])  # four have a loop of their own
-@pytest.mark.parametrize("forgetting", ["exponential", "directional"])
-def test_a_stuck_signal_makes_no_coefficient_surer(forgetting: Forgetting, n: int) -> None:
+def test_a_stuck_signal_makes_no_coefficient_surer(n: int) -> None:
     rng = np.random.default_rng(0)
     phi = np.column_stack([rng.normal(size=(12_000, n - 1)), np.ones(12_000)])
     truth = np.array([1.0, -2.0, 0.5, 3.0, 2.0])[:n]
     y = phi @ truth + 0.1 * rng.normal(size=12_000)
-    rls = RecursiveLeastSquares(n, forgetting=forgetting, memory=500)
+    rls = RecursiveLeastSquares(n, memory=500)
     rls.update(phi[:10_000], y[:10_000])
     sd, noise = np.sqrt(np.diag(rls.covariance)), rls.noise_variance
     stuck = np.tile(phi[10_000], (300_000, 1))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ambid.recursive.estimator import RecursiveEstimator
-from ambid.recursive.regression import Lms, Nlms, RecursiveInstrumentalVariables, RecursiveLeastSquares
+from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
 from tests.tiers import runs
 
 RUNS = runs(400, short=100)
@@ -52,7 +52,6 @@ RECURSIONS = {
     "least squares": lambda: RecursiveLeastSquares(4),
     "memory of 400": lambda: RecursiveLeastSquares(4, memory=400),
     "memory of 50": lambda: RecursiveLeastSquares(4, memory=50),
-    "directional": lambda: RecursiveLeastSquares(4, forgetting="directional", memory=100),
 }
 
 
@@ -73,15 +72,3 @@ def test_gradient_recursions_know_their_error(make: Callable[[], RecursiveEstima
     z = scores(make, phi, phi @ TRUTH + 0.5 * rng.normal(size=(1500, RUNS)), TRUTH)
     covered = (np.abs(z) < 1.96).mean(axis=0)
     assert ((covered > RUNS.limit(0.917)) & (covered < RUNS.limit(0.983))).all(), covered
-
-
-def test_in_a_loop_with_coloured_noise_only_instruments_are_consistent_and_honest() -> None:
-    phi, y, past = autoregression(4000, 0.9, 0.8, IN_LOOP)
-    biased = scores(lambda: RecursiveLeastSquares(4), phi, y, IN_LOOP)
-    assert np.abs(biased.mean(axis=0)).max() > 5
-    rows = np.concatenate([phi, past], axis=-1)
-    for settings in ({}, {"memory": 1000.0}):
-        z = scores(lambda s=settings: RecursiveInstrumentalVariables(4, n_instruments=6, **s), rows, y, IN_LOOP)
-        covered = (np.abs(z) < 1.96).mean(axis=0)
-        assert (np.abs(z.mean(axis=0)) < RUNS.limit(0.2, centre=0)).all()
-        assert ((covered > RUNS.limit(0.90)) & (covered < RUNS.limit(0.98))).all(), covered

@@ -67,7 +67,8 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "design controller": {"method": "--kind", "export": "--law", "judges": "", "schedule": ""},
     "design experiment": {"lines": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
-    "acquire": {"no-live": "", "quiet": ""}, "track": {"start-seconds": "--start S", "no-live": "", "quiet": ""},
+    "acquire": {"no-live": "", "quiet": ""},
+    "track": {"reference": "", "start-seconds": "--start S", "no-live": "", "quiet": ""},
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
 }  # fmt: skip
 

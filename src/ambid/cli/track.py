@@ -35,7 +35,7 @@ def command(v: Values) -> None:
     start = Path(x) if isinstance(x := _number(v.start), str) else x
     how = v.only("every_s limit pace rate_hz") | {"start": start, "memory": _number(v.memory), "flags": times}
     check_settings(how)
-    own = {name: x for name, x in v.only("input output reference orders open_loop step").items() if x}
+    own = {name: x for name, x in v.only("input output orders open_loop step").items() if x}
     if v.method == "rpem" and own:
         raise AmbidError(
             f"{', '.join(own)}: not for the supervised tracker. Name another {setting('method')}, or omit it"

@@ -95,7 +95,6 @@ class EstimatorWords(TypedDict, total=False):
 
     input: Names | None
     output: Names | None
-    reference: Names | None
     orders: Orders | str | None
     open_loop: bool
     step: float | None

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from ambid.recursive import (
     Nlms,
     RecursiveArx,
     RecursiveEstimator,
-    RecursiveIvArx,
     RecursiveLeastSquares,
     RecursivePolynomial,
 )
@@ -37,7 +36,7 @@ from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, Track
 from ambid.rig import Rig, default_rig
 from ambid.settings.caller import refuse_given, setting
 
-REGRESSIONS = ("rls", "lms", "nlms", "iv")
+REGRESSIONS = ("rls", "lms", "nlms")
 POLYNOMIALS = ("fir", "arx", "armax", "arma", "ararx", "ararmax", "oe", "bj")
 JOINT = ("ekf", "ukf")
 METHODS = ("rpem", *REGRESSIONS, *POLYNOMIALS, *JOINT)
@@ -74,11 +73,11 @@ def track_estimator(
     """Follow a record with one of `METHODS` other than ``rpem``; `start` is of a joint filter."""
     if method not in METHODS:
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
-    inputs, outputs, references = (names_of(settings.get(x)) for x in ("input", "output", "reference"))  # type: ignore[arg-type]
+    inputs, outputs = (names_of(settings.get(x)) for x in ("input", "output"))  # type: ignore[arg-type]
     orders = orders_of(settings.get("orders"))
     refusal = f"{setting('method', method)} takes no {{}}. Omit it"
     if method in JOINT:
-        columns = {"input": inputs, "output": outputs, "reference": references, "orders": orders}
+        columns = {"input": inputs, "output": outputs, "orders": orders}
         refuse_given(columns, refusal)
         job = _joint(method, record, rig, start, how.memory, part)
     else:
@@ -86,7 +85,7 @@ def track_estimator(
         whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"), layout=part.get("layout"))
         span = part.get("from_s"), part.get("to_s")
         part_record = whole if span == WHOLE else cut(whole, *span)
-        data = io_data(part_record, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
+        data = io_data(part_record, inputs, outputs, open_loop=settings.get("open_loop", False))
         if data.y.shape[1] != 1:
             raise EstimationError(
                 f"{method} tracks one output; {data.y.shape[1]} were named. Name one with {setting('output')}"
@@ -106,7 +105,7 @@ def _coefficients(
     if method in REGRESSIONS:
         na, nb, nk = _arx_orders(f"{setting('method', method)}", data, orders)
         u, y, sizes = _scale(method, data)
-        estimator = _arx(method, (na, nb, nk), data, samples, step)
+        estimator = _arx(method, (na, nb, nk), samples, step)
         label = f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}"
     else:
         if step is not None or orders is None:
@@ -138,12 +137,9 @@ def _coefficients(
 
 
 def _scale(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return inputs (then instruments) and output at mean zero and size one, and sizes, from the first samples as
-    on-line.
-    """
+    """Return inputs and output at mean zero and size one, and sizes, from the first samples as on-line."""
     first = slice(0, max(_FIRST_SAMPLES, round(_FIRST_S / data.dt)))
-    external = data.reference if method == "iv" and data.references else np.empty((data.y.shape[0], 0))
-    u, y = np.hstack([data.u, external]), data.y
+    u, y = data.u, data.y
     means, sizes = zip(*((x[first].mean(axis=0), x[first].std(axis=0)) for x in (u, y)), strict=True)
     if not all((size > 0).all() for size in sizes):
         raise EstimationError(
@@ -169,27 +165,15 @@ def _arx_orders(who: str, data: IOData, orders: Orders | None) -> tuple[int, tup
 def _arx(
     method: str,
     orders: tuple[int, tuple[int, ...], tuple[int, ...]],
-    data: IOData,
     memory: float | None,
     step: float | None,
-) -> RecursiveArx | RecursiveIvArx:
+) -> RecursiveArx:
     na, nb, nk = orders
     if step is not None and method not in _STEP:
         raise EstimationError(f"{setting('method', method)} takes no {setting('step')}. Omit it")
     if memory is not None and method in _STEP:
         raise EstimationError(
             f"{setting('method', method)} forgets by its {setting('step')} and takes no {setting('memory')}. Omit it"
-        )
-    if method == "iv":
-        if len(nb) != 1 or not (data.references or data.open_loop):
-            raise EstimationError(
-                f"{setting('method')} iv needs one input, and the loop's external excitation as instrument. Name it "
-                "with "
-                f"{setting('reference')}, or give {setting('open_loop', True)} if there is no feedback"
-            )
-        instruments: Literal["reference", "auxiliary model"] = "reference" if data.references else "auxiliary model"
-        return RecursiveIvArx(
-            na, nb[0], nk[0], instruments=instruments, offset=True, open_loop=data.open_loop, memory=memory
         )
     size = _STEP.get(method, 0.0) if step is None else step
     make: dict[str, Callable[[tuple[str, ...]], RecursiveEstimator]] = {
@@ -204,8 +188,7 @@ def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
     """Return what is doubtful before the first sample: bias under feedback, above all."""
     if method in ("rls", "lms", "nlms") and not data.open_loop:
         return (
-            f"{method} is biased by feedback and by coloured noise. Use armax, or iv with {setting('reference')}, or "
-            "give "
+            f"{method} is biased by feedback and by coloured noise. Use armax, or give "
             f"{setting('open_loop', True)} if there is no feedback",
         )
     return tuple(w for w in getattr(estimator, "warnings", ()) if "first window" not in w)

@@ -53,7 +53,6 @@ def track(
     method: str = "rpem",
     input: Names | None = None,  # noqa: A002 - the words of the command
     output: Names | None = None,
-    reference: Names | None = None,
     orders: Orders | str | None = None,
     open_loop: bool = False,
     step: float | None = None,
@@ -86,7 +85,7 @@ def track(
         What is known of the bench; default: columns voltage, current and position, everything free.
     method : str, optional
         ``rpem``, the supervised tracker, or one of `ambid.job.track_estimator.METHODS`.
-    input, output, reference : str or sequence of str, optional
+    input, output : str or sequence of str, optional
         Names of channels, for methods that follow coefficients.
     orders : str or Mapping[str, int], optional
         Of those coefficients, as `ambid.fit`.
@@ -131,7 +130,7 @@ def track(
     )  # fmt: skip
     check_settings({**following, "start": start, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz})
     say, how, settings = tick or silent, Following(**following), EstimatorWords(
-        input=input, output=output, reference=reference, orders=orders, open_loop=open_loop, step=step,
+        input=input, output=output, orders=orders, open_loop=open_loop, step=step,
     )  # fmt: skip
     bench = None if rig is None else known_rig(rig)
     part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units, layout=layout)

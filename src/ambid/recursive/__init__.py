@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from ambid.recursive.regression import Lms as Lms
     from ambid.recursive.regression import Nlms as Nlms
     from ambid.recursive.regression import RecursiveArx as RecursiveArx
-    from ambid.recursive.regression import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
-    from ambid.recursive.regression import RecursiveIvArx as RecursiveIvArx
     from ambid.recursive.regression import RecursiveLeastSquares as RecursiveLeastSquares
 
 __getattr__, __dir__, __all__ = exports(__name__)

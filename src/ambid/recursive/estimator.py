@@ -153,13 +153,6 @@ def positive(name: str, value: float) -> float:
     return float(value)
 
 
-def count(name: str, value: int) -> int:
-    """Return `value` where it is a whole number of samples, one or more."""
-    if value != int(value) or value < 1:
-        raise EstimationError(f"{name} is {value!r}; it must be a whole number of samples, 1 or more")
-    return int(value)
-
-
 def numbers(name: str, value: ArrayLike, p: int) -> Array:
     """Return `value` as p finite numbers (p,), a single one for all."""
     found = np.asarray(value, dtype=np.float64)

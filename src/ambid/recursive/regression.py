@@ -1,11 +1,11 @@
 """Recursions for y = φᵀθ + e over the square-root core: least squares with forgetting (Bierman 1977, ch. V; Ljung &
-Söderström 1983, sec. 6.2), LMS, NLMS, instrumental variables, and ARX models estimated by any of these.
+Söderström 1983, sec. 6.2), LMS, NLMS, and ARX models estimated by any of these.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,6 @@ from ambid.recursive.estimator import (
     Copied,
     RecursiveEstimator,
     as_blocks,
-    count,
     covariance_of,
     factors_of,
     forgetting_factor,
@@ -24,12 +23,8 @@ from ambid.recursive.estimator import (
     numbers,
     positive,
     prior_of,
-    root_of,
     root_of_factors,
 )
-
-Forgetting = Literal["none", "exponential", "directional"]
-Instruments = Literal["reference", "auxiliary model"]
 
 VAGUE = 1e22  # variance of a coefficient of which nothing is known, whatever its unit
 ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
@@ -40,8 +35,6 @@ _NOISE_RATE = 1e-4  # of forgetting of the noise variance, a sample, for recursi
 _LOOKS = 32  # most samples between two looks at the limit
 _FAR = 1e12  # variance of the start's error in units of step or of 1 / small, which have the signals' units
 _FLOAT = np.dtype(np.float64)
-_REFRESH = 64  # samples with one auxiliary model
-_NO_MODEL = np.zeros(0)
 
 
 class Recursion(Copied):
@@ -139,14 +132,10 @@ class _Factored(Recursion):
 class RecursiveLeastSquares(_Factored):
     """Recursive least squares, a `RecursiveEstimator`: O(p²) a sample, nothing inverted.
 
-    What is forgotten:
-
-    - ``"none"``: nothing. The estimate is that of batch least squares with the same prior.
-    - ``"exponential"``: a sample k samples ago weighs factor**k. Where the regressor lacks a direction, P grows there
-      (wind-up) until the mean of P_ii over its prior is `limit`; forgetting is then slowed for all directions so far
-      that it stays there: coefficients that are still excited are tracked more slowly meanwhile.
-    - ``"directional"``: only the part of the information that the present regressor meets is forgotten: without
-      excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`.
+    Without `factor` or `memory` nothing is forgotten: the estimate is that of batch least squares with the same
+    prior. Else a sample k samples ago weighs factor**k. Where the regressor lacks a direction, P grows there (wind-up)
+    until the mean of P_ii over its prior is `limit`; forgetting is then slowed for all directions so far that it stays
+    there: coefficients that are still excited are tracked more slowly meanwhile.
 
     The covariance is that of the estimate's error for coefficients that do not move, e white and independent of past
     regressors: σ²C, C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ; with forgetting less than σ²P, by 1 + factor in the stationary
@@ -155,7 +144,7 @@ class RecursiveLeastSquares(_Factored):
 
     σ² is tracked on errors e over 1 + φᵀCφ, each with the weight of what it says of the estimate: silence does not
     lower it. Biased like all least squares where e is coloured and correlated with the regressor, as under feedback or
-    for noisy regressors: then take `RecursiveInstrumentalVariables`. Factors U and D > 0 keep P positive definite
+    for noisy regressors: then take `RecursivePolynomial`. Factors U and D > 0 keep P positive definite
     whatever is rounded; the limit bounds P from above, the data from below.
 
     Parameters
@@ -167,8 +156,6 @@ class RecursiveLeastSquares(_Factored):
     prior : array_like, shape (), (p,) or (p, p), optional
         Covariance of the start's error **over the variance of e** (P₀), in the coefficients' units. If not given,
         nothing is known of the coefficients, whatever the units of the signals: the start has no weight.
-    forgetting : {"none", "exponential", "directional"}, optional
-        Exponential if not given but `factor` or `memory` is.
     factor, memory : float, optional
         Of forgetting, 0 < factor < 1; the same as a time constant in samples, 1 / (1 - factor).
     limit : float
@@ -196,22 +183,14 @@ class RecursiveLeastSquares(_Factored):
         *,
         start: ArrayLike | None = None,
         prior: ArrayLike | None = None,
-        forgetting: Forgetting | None = None,
         factor: float | None = None,
         memory: float | None = None,
         limit: float = 100.0,
         noise_sd: float | None = None,
     ) -> None:
-        forgets = factor is not None or memory is not None
-        if forgetting not in (None, "none", "exponential", "directional"):
-            raise EstimationError(f"forgetting is {forgetting!r}; it is none, exponential or directional")
-        if forgets and forgetting == "none":
-            raise EstimationError("forgetting is none; omit factor and memory")
-        if not forgets and forgetting in ("exponential", "directional"):
-            raise EstimationError(f"forgetting is {forgetting}; it needs a factor or a memory. Give one")
         super().__init__(names, start, noise_sd)
         s, p, at = self._s, len(self._names), self._at
-        s[at.KIND] = at.DIRECTIONAL if forgetting == "directional" else at.LEAST_SQUARES
+        s[at.KIND] = at.LEAST_SQUARES
         self._forget(factor, memory, limit)
         s[at.VAGUE] = float(prior is None)
         s[at.TYPICAL], s[at.NOW] = 0.1 * p, 1.0
@@ -220,10 +199,8 @@ class RecursiveLeastSquares(_Factored):
         prior = prior_of("prior", VAGUE if prior is None else prior, p)
         scale = np.sqrt(np.diag(prior))
         inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
-        # the companion begins as the covariance of the error, or as the information of squared weights
-        directional = s[at.KIND] == at.DIRECTIONAL
         self._factors(0)[:] = factors_of(prior)
-        self._factors(1)[:] = factors_of(prior if directional else (inverse + inverse.T) / 2)
+        self._factors(1)[:] = factors_of((inverse + inverse.T) / 2)  # information of squared weights
         s[at.HEAD + p + 2 * p * p :][:p] = np.diag(prior)
 
     @property
@@ -236,8 +213,6 @@ class RecursiveLeastSquares(_Factored):
         """A copy of the covariance of the estimate's error, shape (p, p)."""
         s, at = self._s, self._at
         unit = float(s[at.UNIT] or self.noise_variance)
-        if s[at.KIND] == at.DIRECTIONAL:
-            return unit * covariance_of(self._factors(1))
         if s[at.FACTOR] == 1.0:
             return self.noise_variance * self.P
         half = root_of_factors(self._factors(1)).T @ self.P
@@ -367,154 +342,27 @@ class Nlms(_Gradient):
         super().__init__(names, start, prior, noise_sd, far, KIND=self._at.NLMS, STEP=step, SMALL=small)
 
 
-class RecursiveInstrumentalVariables(Recursion):
-    """Recursive instrumental variables, a `RecursiveEstimator` whose inputs are [φ, ζ]: Σ λ^(t-k) ζ (y - φᵀθ) = 0, with
-    more instruments than coefficients by two-stage least squares (Söderström & Stoica 1983, ch. 4 and 8).
-
-    Consistent where ζ is uncorrelated with v and correlated with φ: with an external reference of a loop, past inputs
-    in open loop. Instruments that say little of the regressor give a large covariance.
-
-    The covariance is that of the estimate's error for coefficients that do not move, A N Aᵀ with θ̂ = A Σ λ^(t-k) ζ y
-    and N the covariance of Σ λ^(t-k) ζ v: the long-run covariance of ζ v (Bartlett's weights over `correlation`
-    samples; Newey & West 1987), tracked with ten times the memory of the estimate, times the sum of squared weights. So
-    v may be coloured. The lag behind moving coefficients is not in it. While instruments are silent the information is
-    forgotten until the variances reach `limit`. Nothing is known before the first sample.
-
-    Parameters
-    ----------
-    names : sequence of str, or int
-        Names of the p coefficients, or p.
-    n_instruments : int, optional
-        m, p or more; p if not given.
-    factor, memory : float, optional
-        Of forgetting, 0 < factor < 1; the same as a time constant in samples, 1 / (1 - factor). Neither: nothing is.
-    limit : float
-        Of the wind-up, see above: of the mean of the variances over 1e9 times the best so far.
-    correlation : int
-        Samples; several times the time over which v is correlated. 1 for white v.
-
-    Attributes
-    ----------
-    names : tuple of str
-    estimate : ndarray, shape (p,)
-    covariance : ndarray, shape (p, p)
-    n_used, n_rejected : int
-    noise_variance : float
-        Of v.
-
-    Raises
-    ------
-    EstimationError
-        If a setting is out of its range.
-    """
-
-    def __init__(
-        self,
-        names: Sequence[str] | int,
-        *,
-        n_instruments: int | None = None,
-        factor: float | None = None,
-        memory: float | None = None,
-        limit: float = 100.0,
-        correlation: int = 20,
-    ) -> None:
-        found = coefficient_names(names)
-        p = len(found)
-        m = p if n_instruments is None else int(n_instruments)
-        if m < p:
-            raise EstimationError(f"{m} instruments do not determine {p} coefficients. Give {p} or more")
-        lags = count("correlation", correlation)
-        size = p + m * (m + p + 1) + p * p + m * m + lags * m + m + p + m + m * (p + 1) + 2 * (m + p) + 1
-        super().__init__(found, p + m, size, None, None)
-        s, at = self._s, self._at
-        s[at.INSTRUMENTS], s[at.LAGS], s[at.PRIOR_LEFT] = m, lags, 1.0
-        self._forget(factor, memory, limit)
-        part = self._parts()
-        # the vague prior is entered as samples whose instruments are the coefficients' own directions
-        part["prior"][...] = VAGUE
-        part["size"][...] = 1.0 / np.sqrt(VAGUE)
-        np.fill_diagonal(part["T"], 1.0 / np.sqrt(VAGUE))
-        np.fill_diagonal(part["R"], 1.0 / np.sqrt(VAGUE))
-        part["R"][:p, m:-1] = part["T"]
-
-    def _run(self, rows: Array, y: Array, out: Array) -> None:
-        kernels("regression").instrumental(self._s, rows, y, out)
-
-    @property
-    def _m(self) -> int:
-        return int(self._s[self._at.INSTRUMENTS])
-
-    def _parts(self) -> dict[str, Array]:
-        """Views of the state by name."""
-        p, m, lags = len(self._names), self._m, int(self._s[self._at.LAGS])
-        shapes: dict[str, tuple[int, ...]] = {
-            "estimate": (p,),
-            "R": (m, m + p + 1),
-            "T": (p, p),
-            "omega": (m, m),
-            "ring": (lags, m),
-            "total": (m,),
-            "prior": (p,),
-            "size": (m,),
-        }
-        found, first = {}, self._at.HEAD
-        for name, shape in shapes.items():
-            n = int(np.prod(shape))
-            found[name] = self._s[first : first + n].reshape(shape)
-            first += n
-        return found
-
-    def _scale_instruments(self, first: int, factor: float) -> None:
-        """Count what the first instruments have told as if they had been larger; the estimate stays."""
-        part, size = self._parts(), np.ones(self._m)
-        size[:first] = factor
-        part["R"][:, : self._m] *= size
-        part["omega"][...] *= np.outer(size, size)
-        for name in ("ring", "total", "size"):
-            part[name][...] *= size
-
-    @property
-    def covariance(self) -> Array:
-        """A copy of the covariance of the estimate's error, shape (p, p)."""
-        from scipy.linalg import solve_triangular
-
-        part, s, m, at = self._parts(), self._s, self._m, self._at
-        N = np.diag(s[at.PRIOR_LEFT] * self.noise_variance * part["size"] ** 2)
-        if s[at.NOISE_WEIGHT] >= ENOUGH:
-            N = N + part["omega"] * (s[at.SUM_OF_SQUARES] / s[at.NOISE_WEIGHT])
-        scale = np.sqrt(np.diag(N))  # what rounding made of the smallest eigenvalues does not count
-        root = scale[:, None] * root_of(N / np.outer(scale, scale), floor=float(np.finfo(float).eps))
-        half = solve_triangular(part["R"][:, :m], root, trans="T")
-        Q, T = np.linalg.qr(part["R"][:, m:-1])  # no singular value is cut: what the data do not see is vague
-        B = solve_triangular(T, Q.T @ half)
-        return np.asarray(B @ B.T)
-
-
 class _OnSignals(Copied):
     """A recursion on regressors that is fed with signals; `columns`: channel (0: output, then inputs, -1: constant 1),
     lag and sign of each column of the regressor.
     """
 
-    def __init__(
-        self, columns: Sequence[tuple[int, int, int]], n_inputs: int, spare: int, estimator: RecursiveEstimator
-    ) -> None:
+    def __init__(self, columns: Sequence[tuple[int, int, int]], n_inputs: int, estimator: RecursiveEstimator) -> None:
         self._table = np.array(columns, dtype=np.int64).reshape(-1, 3)
-        self._past = np.full((max(1, int(self._table[:, 1].max())), 1 + n_inputs + spare), np.nan)
-        self._n_inputs, self._spare, self._estimator = n_inputs, spare, estimator
+        self._past = np.full((max(1, int(self._table[:, 1].max())), 1 + n_inputs), np.nan)
+        self._n_inputs, self._estimator = n_inputs, estimator
 
     def _signals(self, u: ArrayLike, y: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-        """Return channels [y, u] and spare columns of zeros, the outputs (n_samples,) and the shape of `y`."""
-        if isinstance(y, float) and isinstance(u, float) and self._n_inputs == 1 and not self._spare:  # quickly
+        """Return channels [y, u], the outputs (n_samples,) and the shape of `y`."""
+        if isinstance(y, float) and isinstance(u, float) and self._n_inputs == 1:  # quickly
             return np.array([[y, u]]), np.array([y]), ()
         inputs, outputs, shape = as_blocks("ARX", u, y, self._n_inputs)
-        return np.hstack([outputs, inputs, np.zeros((outputs.shape[0], self._spare))]), outputs[:, 0], shape
+        return np.hstack([outputs, inputs]), outputs[:, 0], shape
 
-    def _rows(self, x: Array, theta: Array = _NO_MODEL, first: int = 0) -> Array:
-        """Return the columns (n_samples, n_columns) for the next samples x (n_samples, n_channels). With `theta` (p,),
-        the last channel is filled in: the output of a model without noise, whose regressor begins at column `first`.
-        """
+    def _rows(self, x: Array) -> Array:
+        """Return the columns (n_samples, n_columns) for the next samples x (n_samples, n_channels)."""
         rows = np.empty((x.shape[0], self._table.shape[0]))
-        kernels("regression").tapped(self._past, self._table, x, rows, theta, first)
+        kernels("regression").tapped(self._past, self._table, x, rows)
         return rows
 
     @property
@@ -547,7 +395,7 @@ class RecursiveArx(_OnSignals):
     """A recursion on regressors, fed with signals: a `RecursiveEstimator` of A(q) y = B(q) u + constant + v, φ(t) =
     [-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7).
 
-    Biased where v is coloured, and under feedback with noise that is not white: see `RecursiveIvArx`.
+    Biased where v is coloured, and under feedback with noise that is not white: see `RecursivePolynomial`.
 
     Parameters
     ----------
@@ -586,7 +434,7 @@ class RecursiveArx(_OnSignals):
         orders = [nb] if isinstance(nb, int) else list(nb)
         delays = [nk] * len(orders) if isinstance(nk, int) else list(nk)
         columns, names = columns_of(na, orders, delays, offset=offset)
-        super().__init__(columns, len(orders), 0, estimator(tuple(names)))
+        super().__init__(columns, len(orders), estimator(tuple(names)))
 
     def update(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -609,118 +457,6 @@ class RecursiveArx(_OnSignals):
         """
         x, outputs, shape = self._signals(u, y)
         return self._estimator.update(self._rows(x), outputs).reshape(shape)
-
-
-class RecursiveIvArx(_OnSignals):
-    """An ARX model by recursive instrumental variables, as `ambid.recursive.RecursiveArx`; v may be coloured.
-
-    Instruments:
-
-    - ``"reference"``: na + nb + 2 past values of an external signal r, the last input column, that enters the loop.
-      Consistent under feedback.
-    - ``"auxiliary model"``: past inputs and outputs of the model without noise, with the estimate of up to 64 samples
-      ago while it is stable. Near the best in **open loop; biased under feedback** with coloured v, because then u
-      itself holds v. Before the first stable estimate the model is a delay: the instruments are past inputs.
-
-    Parameters
-    ----------
-    na, nb, nk : int
-        One input: orders and delay.
-    instruments : {"reference", "auxiliary model"}
-    offset : bool
-        Whether a constant is estimated; it is its own instrument.
-    open_loop : bool
-        Declare the loop open: the auxiliary model needs that, and `warnings` tells it.
-    **settings : object
-        Of `RecursiveInstrumentalVariables`.
-
-    Attributes
-    ----------
-    names : tuple of str
-    estimate : ndarray, shape (p,)
-    covariance : ndarray, shape (p, p)
-    n_used, n_rejected : int
-    warnings : tuple of str
-
-    Raises
-    ------
-    EstimationError
-        If a setting is out of its range.
-    """
-
-    _estimator: RecursiveInstrumentalVariables
-
-    def __init__(
-        self,
-        na: int,
-        nb: int,
-        nk: int = 1,
-        *,
-        instruments: Instruments,
-        offset: bool = False,
-        open_loop: bool = False,
-        **settings: Any,
-    ) -> None:
-        columns, names = columns_of(na, [nb], [nk], offset=offset)
-        p = len(columns)
-        if instruments == "reference":
-            more = [(2, lag, 1) for lag in range(1, na + nb + 3)]
-        elif instruments == "auxiliary model":
-            more = [(2, lag, -1) for lag in range(1, na + 1)] + columns[na : na + nb]
-        else:
-            raise EstimationError(f"instruments is {instruments!r}; it is reference or auxiliary model")
-        more += columns[na + nb :]
-        spare = int(instruments == "auxiliary model")
-        estimator = RecursiveInstrumentalVariables(names, n_instruments=len(more), **settings)
-        super().__init__([*columns, *more], 2 - spare, spare, estimator)
-        self._na, self._nb, self._p, self._open_loop = na, nb, p, open_loop
-        self._model, self._count = np.zeros(p), 0
-        self._modelled = nb == 0
-        if nb:  # a model without output would leave the first a to the prior alone, and never be replaced
-            self._model[na + nb - 1] = 1.0
-        if spare:
-            self._past[:, 2] = 0.0
-
-    def update(self, u: ArrayLike, y: ArrayLike) -> Array:
-        """As `RecursiveArx.update`; where the reference is the instrument, it is the last column of `u`."""
-        x, outputs, shape = self._signals(u, y)
-        if not self._spare:
-            return self._estimator.update(self._rows(x), outputs).reshape(shape)
-        errors, start = np.empty(outputs.size), 0
-        while start < outputs.size:
-            stop = min(outputs.size, start + _REFRESH - self._count % _REFRESH)
-            rows = self._rows(x[start:stop], self._model, self._p)
-            errors[start:stop] = self._estimator.update(rows, outputs[start:stop])
-            self._count += stop - start
-            if self._count % _REFRESH == 0:
-                self._renew()
-            start = stop
-        return errors.reshape(shape)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a reader of the estimate has to know."""
-        if not self._spare or self._open_loop:
-            return ()
-        return (
-            "instruments are made of the input (auxiliary model): biased by feedback. Use the reference of the loop, "
-            "or give open_loop if there is no feedback",
-        )
-
-    def _renew(self) -> None:
-        """Take over the estimate as auxiliary model if it is stable."""
-        from scipy.signal import lfilter
-
-        theta = self._estimator.estimate
-        A, B = np.concatenate([[1.0], theta[: self._na]]), theta[self._na : self._na + self._nb]
-        if not np.all(np.abs(np.roots(A)) < 1):
-            return
-        if not self._modelled:  # the delay was of the input's unit: what it gave has to count as the output's does
-            gain = float(np.sqrt(np.sum(lfilter(B, A, np.eye(1, 1000)[0]) ** 2)))  # rms over that of white noise
-            gain = gain if 0 < gain < np.inf else 1.0
-            self._estimator._scale_instruments(self._na, gain)
-            self._past[:, 2] *= gain
-        self._model, self._modelled = theta, True
 
 
 def columns_of(

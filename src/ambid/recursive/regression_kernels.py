@@ -35,19 +35,13 @@ Table = NDArray[np.int64]
     SETTLED,  # weight of the noise variance from which it is the unit of the covariance; infinite where it is known
     UNIT,  # variance in which C is counted; 0: that of the moment
     NOW,  # noise variance of the last look over the unit
-    INSTRUMENTS,  # m
-    LAGS,
-    SUM_OF_SQUARES,  # of the weights of the samples
-    PRIOR_LEFT,  # squared weight that the prior still has
-) = range(24)
-HEAD = 24
+) = range(20)
+HEAD = 20
 
-LEAST_SQUARES, DIRECTIONAL, LMS, NLMS = range(4)
+LEAST_SQUARES, LMS, NLMS = range(3)
 
 # A sample that leads there is rejected; variance over the best one, in place of a prior; least noise over the unit.
 _HUGE, _WORSE, _SILENT = 1e200, 1e9, 1e-12
-_SINGULAR = 1e-12
-_LITTLE = 0.1  # of the usual leverage, at which a sample counts half
 
 
 @compiled(error_model="numpy")
@@ -138,25 +132,6 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
 
 
 @compiled(error_model="numpy")
-def _forget(s: Array, F: Array, x: Array, a: Array) -> None:
-    """Widen P before a sample so that the information that x meets is forgotten (Cao and Schwartz 2000): P becomes P +
-    (1/λ - 1) x xᵀ / (xᵀ P⁻¹ x).
-    """
-    p = x.size
-    for j in range(p):
-        a[j] = x[j]
-    met = 0.0
-    for j in range(p - 1, -1, -1):  # xᵀ P⁻¹ x by U⁻¹ x
-        met += a[j] / F[j, j] * a[j]
-        for i in range(j):
-            a[i] -= a[j] * F[j, i]
-    if 0.0 < met < _HUGE:
-        for j in range(p):
-            a[j] = x[j]
-        widen(F, a, (1.0 / s[FACTOR_NOW] - 1.0) / met)
-
-
-@compiled(error_model="numpy")
 def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: float) -> int:
     """Take in samples t, ... until so many have been used; return the first that was not taken."""
     first, q = HEAD + p, p * p
@@ -193,21 +168,15 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
                 s[TYPICAL] = 0.1 * leverage
             spread = size(G, f)
         else:
-            if kind == LEAST_SQUARES:
-                for j in range(p):
-                    F[j, j] *= grow
-                    G[j, j] *= drop
-            else:
-                _forget(s, F, x, a)
-                project(F, x, f)
+            for j in range(p):
+                F[j, j] *= grow
+                G[j, j] *= drop
             alpha = shrink(F, f, one, k)
             leverage = spread = alpha - 1.0
             for j in range(p):
                 theta[j] += k[j] * (e / alpha)
                 a[j] = k[j] / alpha
-            if kind == DIRECTIONAL:
-                now = noise_of_now(s)
-            project(G, k if kind == LEAST_SQUARES else x, f)
+            project(G, k, f)
             spread = min(size(G, f) / now, spread)  # not more than P says, but where the noise has just fallen
         if leverage > 0.0:  # σ² = E e² / (1 + φᵀCφ): a sample that says little of the estimate says little of its noise
             w, share = 1.0 / (1.0 + spread), leverage / (leverage + s[TYPICAL])
@@ -220,7 +189,7 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
             widen(G, x, now)
         else:
             # C becomes (I - Kφᵀ) C (I - Kφᵀ)ᵀ + r K Kᵀ: the best gain's, and a square of what K differs from it
-            alpha = shrink(G, f, one if gradient else noise_of_now(s), k)
+            alpha = shrink(G, f, one, k)
             root = np.sqrt(alpha)
             for j in range(p):
                 a[j] = root * a[j] - k[j] / root
@@ -257,181 +226,24 @@ def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
 
 
 @compiled(error_model="numpy")
-def _solve(R: Array, T: Array, work: Array, theta: Array, m: int, p: int) -> None:
-    """Least squares of the columns of φ on that of y: triangle into T, solution into theta unless it is singular."""
-    for i in range(m):
-        for j in range(p + 1):
-            work[i, j] = R[i, m + j]
-    sound = True
-    for k in range(p):
-        size, all_of_it = 0.0, 0.0
-        for i in range(m):
-            all_of_it += work[i, k] ** 2
-            if i >= k:
-                size += work[i, k] ** 2
-        sound = sound and size > _SINGULAR**2 * all_of_it
-        length = -np.sqrt(size) if work[k, k] > 0 else np.sqrt(size)
-        head = work[k, k] - length
-        if head != 0.0:
-            for j in range(k + 1, p + 1):
-                dot = head * work[k, j]
-                for i in range(k + 1, m):
-                    dot += work[i, k] * work[i, j]
-                dot /= length * head
-                work[k, j] += dot * head
-                for i in range(k + 1, m):
-                    work[i, j] += dot * work[i, k]
-        work[k, k] = length
-    if not sound:
-        return
-    for i in range(p):
-        for j in range(i, p):
-            T[i, j] = work[i, j]
-    for i in range(p - 1, -1, -1):
-        x = work[i, p]
-        for j in range(i + 1, p):
-            x -= T[i, j] * theta[j]
-        theta[i] = x / T[i, i]
-
-
-@compiled(error_model="numpy")
-def _length(T: Array, x: Array, solved: Array) -> float:
-    """Return xᵀ (TᵀT)⁻¹ x for an upper triangle."""
-    total = 0.0
-    for i in range(x.size):
-        v = x[i]
-        for j in range(i):
-            v -= T[j, i] * solved[j]
-        solved[i] = v / T[i, i]
-        total += solved[i] ** 2
-    return total
-
-
-@compiled(error_model="numpy")
-def instrumental(s: Array, rows: Array, y: Array, out: Array) -> None:
-    """Take in rows [φ, ζ] (n, p + m) and y (n,); errors of prediction into out (n,).
-
-    `s`: head | estimate p | R m (m + p + 1), the triangle of weighted rows [ζᵀ φᵀ y], not squared | T p p, that of its
-    φ | long-run covariance m m | ring lags m | its sum m | prior p | size of the instruments m | work.
-    """
-    p, m, lags = int(s[SIZE]), int(s[INSTRUMENTS]), int(s[LAGS])
-    a = HEAD
-    theta = s[a : a + p]
-    a += p
-    R = s[a : a + m * (m + p + 1)].reshape(m, m + p + 1)
-    a += m * (m + p + 1)
-    T = s[a : a + p * p].reshape(p, p)
-    a += p * p
-    omega = s[a : a + m * m].reshape(m, m)
-    a += m * m
-    ring = s[a : a + lags * m].reshape(lags, m)
-    a += lags * m
-    total, prior = s[a : a + m], s[a + m : a + m + p]
-    a += m + p + m
-    work = s[a : a + m * (p + 1)].reshape(m, p + 1)
-    a += m * (p + 1)
-    new = s[a : a + m + p + 1]
-    a += m + p + 1
-    unit, solved = s[a : a + p], s[a + p : a + p + m]
-    for t in range(y.size):
-        e, power = y[t], y[t] ** 2
-        for j in range(p):
-            e -= rows[t, j] * theta[j]
-        for j in range(p + m):
-            power += rows[t, j] ** 2
-        if not (power + e * e < _HUGE):
-            out[t] = np.nan
-            s[REJECTED] += 1.0
-            continue
-        for j in range(m):
-            new[j] = rows[t, p + j]
-        for j in range(p):
-            unit[j] = new[m + j] = rows[t, j]
-        new[m + p] = y[t]
-        factor = s[FACTOR_NOW]
-        root, spread = np.sqrt(factor), _length(T, unit, solved) / (1.0 + factor)
-        for i in range(m):  # rotate the row into the weighted rows of before; what remains of it is dropped
-            r, x = root * R[i, i], new[i]
-            length = np.hypot(r, x)
-            c, d = (r / length, x / length) if length > 0 else (1.0, 0.0)
-            R[i, i] = length
-            for j in range(i + 1, new.size):
-                b, x = root * R[i, j], new[j]
-                R[i, j] = c * b + d * x
-                new[j] = c * x - d * b
-        _solve(R, T, work, theta, m, p)
-        for j in range(m):
-            new[j] = rows[t, p + j]
-        _account(s, R, omega, ring, total, new[:m], e, 1.0 / (1.0 + spread), solved)
-        s[USED] += 1.0
-        if s[USED] % s[EVERY] == 0:  # the factor that keeps the mean of the variances over the prior's below its limit
-            mean = 0.0
-            for i in range(p):
-                for j in range(p):
-                    unit[j] = 1.0 if j == i else 0.0
-                now = _length(T, unit, solved)
-                prior[i] = min(prior[i], _WORSE * now)
-                mean += now / (prior[i] * p * s[LIMIT])
-            s[FACTOR_NOW] = min(1.0, mean ** (1.0 / s[EVERY])) if mean > s[FACTOR] ** s[EVERY] else s[FACTOR]
-        out[t] = e
-
-
-@compiled(error_model="numpy")
-def _account(
-    s: Array, R: Array, omega: Array, ring: Array, total: Array, zeta: Array, e: float, w: float, solved: Array
-) -> None:
-    """Track noise and weights, a sample by what its instruments add to those before. The long-run covariance of ζ e has
-    Bartlett's weights: the mean square of its sums over `lags` samples.
-    """
-    m, lags, factor = zeta.size, ring.shape[0], s[FACTOR_NOW]
-    leverage = _length(R, zeta, solved)
-    share = leverage / (leverage + _LITTLE * m / min(s[USED] + 1.0, s[MEMORY]))
-    keep, weighted = 1.0 - s[NOISE_RATE] * share, w * e
-    place = int(s[USED] % lags)
-    for i in range(m):
-        total[i] -= ring[place, i]
-        ring[place, i] = zeta[i] * weighted
-        total[i] += ring[place, i]
-        if place == lags - 1:  # afresh, or rounding adds up
-            total[i] = 0.0
-            for k in range(lags):
-                total[i] += ring[k, i]
-    for i in range(m):
-        for j in range(i + 1):
-            omega[i, j] = keep * omega[i, j] + share / lags * total[i] * total[j]
-            omega[j, i] = omega[i, j]
-    s[NOISE_SUM] = keep * s[NOISE_SUM] + share * weighted * weighted
-    s[NOISE_WEIGHT] = keep * s[NOISE_WEIGHT] + share * w
-    s[SUM_OF_SQUARES] = factor * factor * s[SUM_OF_SQUARES] + (1.0 + _LITTLE) * share
-    s[PRIOR_LEFT] *= factor * factor
-
-
-@compiled(error_model="numpy")
-def tapped(past: Array, table: Table, x: Array, rows: Array, theta: Array, first: int) -> None:
+def tapped(past: Array, table: Table, x: Array, rows: Array) -> None:
     """Fill rows (n, n_columns) from signals x (n, n_channels) and those before, past (n_lags, n_channels), by `table`:
-    channel (-1: 1), lag, sign. With `theta` (p,), the last channel is made here: a model's output without noise, from
-    columns `first`, .... The row of a sample that is not finite begins with NaN.
+    channel (-1: 1), lag, sign. The row of a sample that is not finite begins with NaN.
     """
-    lags, last = past.shape[0], x.shape[1] - 1
+    lags = past.shape[0]
     for t in range(x.shape[0]):
         finite = True
         for c in range(x.shape[1]):
-            if theta.size == 0 or c < last:
-                finite = finite and np.isfinite(x[t, c])
+            finite = finite and np.isfinite(x[t, c])
         for j in range(table.shape[0]):
             c, k = table[j, 0], t - table[j, 1]
             if c < 0:
                 rows[t, j] = 1.0
             else:
                 rows[t, j] = table[j, 2] * (x[k, c] if k >= 0 else past[lags + k, c])
-        if theta.size > 0:
-            made = 0.0
-            for j in range(theta.size):
-                made += rows[t, first + j] * theta[j]
-            x[t, last] = made if np.isfinite(made) else 0.0
         if not finite:
             rows[t, 0] = np.nan
     n = x.shape[0]
     for k in range(lags):
-        for c in range(last + 1):
+        for c in range(x.shape[1]):
             past[k, c] = past[k + n, c] if k + n < lags else x[k + n - lags, c]

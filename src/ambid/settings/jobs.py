@@ -58,10 +58,10 @@ _JOBS = (
     declare("console", "folder port no_browser read_only",
         port={"help": "Port of the page; 0: any that is free.", "default": 0, "most": 65535, "kind": "whole",
         "metavar": "N", "required": False}),
-    declare("track", "record rig method input output orders reference open_loop step start every_s limit memory pace "
+    declare("track", "record rig method input output orders open_loop step start every_s limit memory pace "
         "flags from_s to_s rate_hz layout json plot report ledger bearing taken_at strict",
         method={"help": "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from @input to "
-        "@output by rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...", "choices": (), "default": "rpem",
+        "@output by rls, lms, nlms, or a recursive arx, armax, oe, bj, ...", "choices": (), "default": "rpem",
         "metavar": "NAME"},
         orders={"help": "Orders of the tracked coefficients.", "default": None},
         pace={"help": "Replay as fast as possible, or in real time."},
