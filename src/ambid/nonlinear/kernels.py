@@ -1,9 +1,9 @@
 """Compiled loops of lagged models and of state-space networks, on scaled signals.
 
-Lagged models: a run, what earlier samples pass on, descent of radial units' weights, a free run whose own set point
-schedules it. Networks, with exact sensitivities: e = y - x[heads], x+ = M [x; u; f; e], f = W2 phi(W1 [x; u] + b1), u's
-last column 1 outside the hidden layer; units are anchored, phi(a + b) = tanh(a + b) - tanh(b) - (1 - tanh(b)^2) a: no
-value or slope at the operating point.
+Lagged models: a run, what earlier samples pass on, a free run whose own set point schedules it. Networks, with exact
+sensitivities: e = y - x[heads], x+ = M [x; u; f; e], f = W2 phi(W1 [x; u] + b1), u's last column 1 outside the hidden
+layer; units are anchored, phi(a + b) = tanh(a + b) - tanh(b) - (1 - tanh(b)^2) a: no value or slope at the operating
+point.
 """
 
 from __future__ import annotations
@@ -100,27 +100,6 @@ def run(
                 z[t, o] = f[o]
             elif innovations:
                 z[t, n_e + o] = z[t, o] - f[o]
-
-
-@compiled(error_model="numpy")
-def descent_pass(F: Array, Y: Array, rate: float, W: Array) -> None:
-    """Take W <- W + eta e f' in place for each row f of F (n, d), eta `rate`, or one over the squared slope if less,
-    with which no error grows.
-    """
-    (n, d), p = F.shape, Y.shape[1]
-    e = np.zeros(p)
-    for t in range(n):
-        size = 0.0
-        for j in range(d):
-            size += p * F[t, j] * F[t, j]
-        eta = min(rate, 1.0 / size) if size > 0.0 else rate
-        for o in range(p):
-            e[o] = Y[t, o]
-            for j in range(d):
-                e[o] -= W[o, j] * F[t, j]
-        for o in range(p):
-            for j in range(d):
-                W[o, j] += eta * e[o] * F[t, j]
 
 
 @compiled(error_model="numpy")

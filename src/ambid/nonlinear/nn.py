@@ -1,7 +1,7 @@
 """State-space network from records (thesis eqs 5.1-5.2, fig. 5.9): its weights are A and B, beside a network G(x, u).
 
 Delay -> subspace start -> the thesis's training and Gauss-Newton (learning curves) -> Levenberg-Marquardt on simulation
-errors -> hidden layer (option) -> predictor gain for coloured errors -> global search if all failed -> covariance.
+errors -> hidden layer (option) -> predictor gain for coloured errors -> covariance.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.progress import Tick, part_of, portions, silent
+from ambid.estimation.progress import Tick, part_of, portions
 from ambid.nonlinear.fit import NonlinearFit, Settings, choice, read_settings, whole
 from ambid.nonlinear.records import scaled_records
 from ambid.nonlinear.state_start import (
@@ -25,7 +25,6 @@ from ambid.nonlinear.state_start import (
     first_network,
     guess_delay,
     matrices_json,
-    search_start,
     train_one_step,
 )  # fmt: skip
 from ambid.nonlinear.state_training import (
@@ -40,16 +39,13 @@ from ambid.nonlinear.state_training import (
     train_each,
 )  # fmt: skip
 
-_USUAL: Mapping[str, object] = {"neurons": 0, "starts": 3, "evaluations": 2000}
+_USUAL: Mapping[str, object] = {"neurons": 0, "starts": 3}
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
 _LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
-_BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
 _MORE = 2  # states beyond the outputs, for the delay
 _LARGEST = 5  # states beyond the outputs that are tried
 _PATIENCE = 2  # states beyond the best, after which no more are tried
-_DELAY, _TRAINING, _RESCUE, _AGAIN = (  # shares of the time: rescues are rare
-    (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 1.0),
-)  # fmt: skip
+_DELAY, _TRAINING = (0.0, 0.15), (0.15, 1.0)  # shares of the time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,11 +68,6 @@ class NnSettings:
     )
     descent: int = whole("iterations of the thesis's steepest descent, for comparison; 10", 0, 10_000, 10)
     iterations: int = whole("of each training, at most; 50", 1, 2000, 50)
-    evaluations: int | None = whole(
-        "evaluations of a global search (one-axis) where starts fail; given, where errors are suspect too; 2000",
-        0,
-        1_000_000,
-    )
     uncertainty: str = choice(
         "laplace, sandwich (coloured errors), none, auto (sandwich if not white); auto",
         *("auto", "laplace", "sandwich", "none"),
@@ -95,7 +86,7 @@ def nn(
 ) -> NonlinearFit:  # fmt: skip
     """Train a state-space network whose weights are A and B (thesis eqs 5.1-5.2, fig. 5.9; with G(x, u): eq. 4.9),
     consistent under feedback as far as the predictor gain holds the noise. In the form ``one-axis`` (position, current
-    and perhaps velocity from a voltage) they are entries of thesis eq. 4.8, with a global search where all starts fail;
+    and perhaps velocity from a voltage) they are entries of thesis eq. 4.8;
     states of ``free``, started from subspace models of several horizons, have no fixed meaning, and nothing bounds the
     entries. Of the form ``one-axis`` a `linear` estimate is one more start, as a local minimum may have nearly the
     right errors.
@@ -124,7 +115,6 @@ def nn(
             _train_all(fitting, part_of(tick, *_TRAINING))
             if linear is not None and s["form"] == "one-axis" and not s["neurons"]:
                 _train_again(fitting, linear)
-        reason = _rescue(fitting, tick, reason, requested="evaluations" in settings)
         _caution(fitting)
     except KeyboardInterrupt:
         fitting.interrupt()
@@ -199,7 +189,7 @@ def _find_first(fitting: Fitting) -> str:
 # --- training --------------------------------------------------------------------------------------------------------
 
 
-def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> None:
+def _train_all(fitting: Fitting, tick: Tick | None) -> None:
     """Train the first network: number of states, the thesis's `descent`, physics, hidden layer, gain."""
     s, data = fitting.settings, fitting.data
     most = int(s["iterations"])
@@ -212,7 +202,7 @@ def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> 
         starts = {n: first_network(data, fitting.dt, n) for n in range(p, p + _LARGEST + 1)}
         fitting.state = _choose_states(fitting, starts, choice) or fitting.state
     first = fitting.state
-    if s["descent"] and descent:
+    if s["descent"]:
         with fitting.stage("one-step training"):
             curves, fitting.details["one_step_training"] = train_one_step(first, data, int(s["descent"]))
             fitting.curves.extend(curves)
@@ -282,70 +272,12 @@ def _choose_states(fitting: Fitting, starts: Mapping[int, State | str], tick: Ti
     return best
 
 
-# --- rescue ----------------------------------------------------------------------------------------------------------
-
-
-def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, requested: bool) -> str:
-    """Search globally where ordinary starts failed (if `requested`, suspect errors are enough), train, return what is
-    left of the reason.
-    """
-    s, before, why = fitting.settings, fitting.state, reason
-    if before is not None:
-        left = misfit(before, fitting.data)
-        if left.failed or (requested and left.suspect):
-            why = str(left)
-    if not why or s["form"] != "one-axis" or not s["evaluations"]:
-        return reason
-    second = replace(fitting, state=None, rivals=[], curves=[], details={}, timing_s={})
-    try:
-        with fitting.stage("global search"):
-            second.state, result = search_start(
-                fitting.data, fitting.dt, _heads(fitting), seed=fitting.seed, evaluations=int(s["evaluations"]),
-                tick=part_of(tick, *_RESCUE) or silent,
-            )  # fmt: skip
-            if second.state is not None:
-                if "delay" not in s:
-                    _find_delay(second, second.state, None)
-                    if second.delay != fitting.delay:
-                        again = State.of(second.state.layout, second.state.theta, second.data)
-                        second.state = add_gain(again, second.data, second.state.K) or second.state
-                _train_all(second, part_of(tick, *_AGAIN), descent=False)
-    except KeyboardInterrupt:
-        fitting.state = second.state if _is_better(second.state, before) else before
-        raise
-    after = second.state
-    better = _is_better(after, before)
-    fitting.details["global_search"] = {
-        "why": why, "failed_starts": 1 + len(_LONG), "evaluations": result.evaluations, "seconds": result.seconds,
-        "log_det_errors_before": None if before is None else before.score,
-        "log_det_errors_after": None if after is None else after.score, "taken": better,
-    }  # fmt: skip
-    message = (
-        f"{1 + len(_LONG)} ordinary starts failed ({why}): a global search (differential evolution, "
-        f"{result.evaluations} evaluations) "
-    )
-    if not better or after is None:
-        fitting.warnings.append(message + "found nothing better. Check channels, their signs and units, and the delay")
-        return reason
-    gained = f"improved the errors from {before.size:.3g} to" if before else "found a network whose errors have"
-    fitting.warnings.append(message + f"{gained} {after.size:.3g} of the outputs' standard deviations")
-    for name in ("state", "status", "data", "delay", "rivals"):
-        setattr(fitting, name, getattr(second, name))
-    fitting.curves += second.curves
-    return ""
-
-
-def _is_better(after: State | None, before: State | None) -> bool:
-    return after is not None and (before is None or after.score < before.score - _BETTER)
-
-
 def _caution(fitting: Fitting) -> None:
     """Warn where a linear regression finds more in the errors than chance puts there."""
     left = None if fitting.state is None else misfit(fitting.state, fitting.data)
     if left is None or not left.suspect:
         return
-    searchable = fitting.settings["form"] == "one-axis" and "global_search" not in fitting.details
-    more = ". Give evaluations=2000 for a global search" if searchable else ""
     fitting.warnings.append(
-        f"{left}: the training ended in a local minimum, or the plant is more complex than this network{more}"
+        f"{left}: the training ended in a local minimum, or the plant is more complex than this network. Check "
+        "channels, their signs and units, and the delay; or take more starts or neurons"
     )

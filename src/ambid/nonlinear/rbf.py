@@ -1,11 +1,7 @@
 """Networks of radial basis functions: a linear part beside units about centres (thesis eqs 1.13, 1.14; Billings 2013).
 
 Lags, what units see, number and width (where open, by held-out errors, of the free run for simulation) -> centres ->
-regularised least squares -> Levenberg-Marquardt, or weights recursively or by steepest descent -> simulation errors.
-Recursive Gauss-Newton: R <- R + mu (phi phi' - R), w <- w + mu R^-1 phi e (thesis eq. 1.14), R as its triangle; with mu
-= 1/(t + 1) and the prior's R_0 it is recursive least squares. Steepest descent: w <- w + rate phi e (thesis eq. 3.22,
-printed as W <- W eta e Phi', its plus sign lost), rate at most 1/|phi|^2, as in NLMS: a sample's error becomes (1 -
-rate |phi|^2) e, which grows over 2/|phi|^2.
+regularised least squares -> Levenberg-Marquardt -> simulation errors.
 """
 
 from __future__ import annotations
@@ -13,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
-from itertools import pairwise
 from time import perf_counter
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -23,7 +18,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.linear import triangle_of
 from ambid.estimation.progress import Tick, portions
 from ambid.nonlinear.fit import (
     NO_WEIGHTS,
@@ -61,9 +56,6 @@ _AS_GOOD = 1.01
 _FAR = 1e6  # times as bad as one step ahead: a free run that diverges
 _MOST_ROWS = 4000  # on which units are placed
 _CANDIDATES = 200  # of the data that may become a centre
-_PASSES = 20  # of steepest descent over the records
-_CHUNKS = 8  # of a pass, after each of which the error is looked at
-_NEAR = 1.0  # squared standard deviations from the optimum, of all that is trained together
 _HELD = 0.01  # part of the variance before the data that is left of a number of the linear part
 _DEPENDENT = 1e-10  # squared length left of a candidate that the chosen ones hold already
 _BLOCK = 4096
@@ -87,15 +79,10 @@ class RbfSettings:
     prior: float | None = number(
         "prior standard deviation of the units' weights, scaled; by restricted likelihood", 1e-6, 1e9
     )
-    training: str = choice(
-        "linear (least squares), recursive (Gauss-Newton by sample), descent (3.22); linear",
-        "linear", "recursive", "descent",
-    )  # fmt: skip
     trained: str = choice(
-        "weights, or all (centres, widths too, by Levenberg-Marquardt; with training=linear); weights",
+        "weights, or all (centres, widths too, by Levenberg-Marquardt); weights",
         "weights", "all",
     )  # fmt: skip
-    rate: float = number("of the steps of the descent, bounded so that no sample's error grows; 0.02", 1e-9, 1e6, 0.02)
     iterations: int = whole("of Levenberg-Marquardt, at most; 60", 1, 2000, 60)
     focus: str = choice(
         "prediction or simulation: errors that are minimised in the end; prediction", "prediction", "simulation"
@@ -169,11 +156,6 @@ class RbfFunction(LaggedFunction):
         """Return what weights multiply: regressors, if there is a linear part, one, and activations."""
         return np.hstack([x[:, : self.line.width], np.ones((x.shape[0], 1)), self.activations(theta, x)])
 
-    def matrix(self, theta: Array) -> Array:
-        """Return the weights, (n_outputs, n_features)."""
-        (L, c), W = self.line.parts(theta[: self.n_line]), theta[self.n_line : self.n_weights].reshape(self.p, -1)
-        return np.hstack([L, c[:, None], W])
-
     def with_matrix(self, theta: Array, W: Array) -> Array:
         """Return the parameters with other weights."""
         d = self.line.width
@@ -231,16 +213,12 @@ class _Work(Draft[RbfFunction]):
 def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
     """Identify y(t) = L z + c + W phi(z) + e(t), biased under feedback or with coloured noise, as errors are taken as
     white. Standard deviations exist only without units, or with trained centres and widths: what the choice adds cannot
-    be told, and intervals without it hold in as few as half of the places. `seed`: of candidates and k-means; `tick`:
+    be told, and intervals without it hold in as few as half of the places. `seed`: of candidates; `tick`:
     called with the stage, may raise KeyboardInterrupt.
     """
     s = read_settings(RbfSettings, "rbf", settings)
     if s.ny == 0 and s.nu == 0:
         raise EstimationError("rbf: ny and nu are both 0, and nothing is left to predict from. Raise one of them")
-    if s.training != "linear" and s.trained == "all":
-        raise EstimationError(
-            f"rbf: training = {s.training} is for the output weights only, but trained = all. Omit one"
-        )
     if None in (s.ny, s.nu, s.neurons, s.width) and not s.held_out > 0:
         raise EstimationError(
             "rbf: held_out is 0, but open settings are chosen by held-out errors. Raise it, or give ny, nu, "
@@ -278,8 +256,7 @@ def _measured(function: LaggedFunction, parts: Parts) -> tuple[Array, Array]:
 
 def _identify(s: RbfSettings, work: _Work, tick: Tick | None) -> None:
     free, parts = s.focus == "simulation", work.data.parts
-    more = s.training != "linear" or s.trained == "all"
-    ticks = portions(tick, (3.0, 0.5, 3.0 * more, 10.0 * free))
+    ticks = portions(tick, (3.0, 0.5, 3.0 * (s.trained == "all"), 10.0 * free))
     if tick is not None:
         tick("start", 0.0)
     with work.stage("choice"):
@@ -294,7 +271,7 @@ def _identify(s: RbfSettings, work: _Work, tick: Tick | None) -> None:
     with work.stage("output weights"):
         began = perf_counter()
         x, y = _measured(function, parts)
-        theta, noise, prior, _ = solve_weights(function, start, x, y, s.prior)
+        theta, _, prior, _ = solve_weights(function, start, x, y, s.prior)
         seconds = np.array([0.0, perf_counter() - began])
         work.function, work.theta, work.start, work.prior = function, theta, start, prior
         training = np.array([_rms(y), rms_error(function, theta, parts)])
@@ -302,9 +279,7 @@ def _identify(s: RbfSettings, work: _Work, tick: Tick | None) -> None:
         work.curves.append(LearningCurve(method=method, seconds=seconds, training=training))
     work.all_numbers = s.trained == "all" and function.neurons > 0
     with work.stage("training"):
-        if s.training != "linear":
-            _train_by_sample(s, work, noise, ticks[2])
-        elif work.all_numbers:
+        if work.all_numbers:
             train_watched(
                 work, work.problem, s.held_out, "Levenberg-Marquardt, all numbers, one-step errors", ticks[2],
                 most=s.iterations, n_linear=function.n_weights,
@@ -499,60 +474,6 @@ def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float
         best = grid[at]
         grid = np.geomspace(low, high, 21)
     return float(best), float(noise(np.array([best]))[0])
-
-
-# --- sample by sample -------------------------------------------------------------------------------------------------
-
-
-def _train_by_sample(s: RbfSettings, work: _Work, noise: Array, tick: Tick | None) -> None:
-    """Train the output weights sample by sample, from zero."""
-    network, rate, parts = work.function, s.rate if s.training == "descent" else None, work.data.parts
-    pull = network.matrix(work.problem(parts, work.theta).precision) * np.sqrt(noise)[:, None]
-    work.theta, curve = train_by_sample(network, work.theta, *_measured(network, parts), pull, rate, tick)
-    work.curves.append(curve)
-    problem = work.problem(parts, work.theta)
-    R = problem.triangle(work.theta[problem.live])
-    left = directions(R[:, :-1]).explain(R[:, -1]) if np.all(np.isfinite(R)) else np.inf
-    if not left < _NEAR:
-        work.status, work.at_optimum = "stalled", False
-        work.warnings.append(
-            f"{curve.method} has not converged: a batch step would still lower the sum of squares by {left:.3g} "
-            "times the error variance, so there are no standard deviations. Give training = linear"
-        )
-
-
-def train_by_sample(
-    network: RbfFunction, theta: Array, x: Array, y: Array, pull: Array, rate: float | None, tick: Tick | None
-) -> tuple[Array, LearningCurve]:
-    """Train the weights from zero by steepest descent with a rate, or Gauss-Newton; `pull` (n_outputs, n_features): the
-    errors' standard deviation over the prior's.
-    """
-    from ambid.nonlinear.kernels import descent_pass
-
-    F = np.ascontiguousarray(network.features(theta, x))
-    (N, d), W = F.shape, np.zeros((network.p, F.shape[1]))
-    method, passes = ("recursive Gauss-Newton", 1) if rate is None else ("steepest descent, bounded rate", _PASSES)
-    edges = np.unique(np.linspace(0, N, _CHUNKS + 1).astype(np.int64)).tolist()
-    descent_pass(F[:0], y[:0], 0.0, W)  # loads the compiled loop, which is no part of the training
-    R = [np.hstack([np.diag(own), np.zeros((d, 1))]) for own in pull]
-    began, seconds, errors = perf_counter(), [0.0], [_rms(y)]
-    for k in range(passes):
-        for first, last in pairwise(edges):
-            part = slice(first, last)
-            if tick is not None:
-                tick(method, (k + first / N) / passes)
-            if rate is None:
-                for o in range(network.p):
-                    R[o] = triangle_of([R[o], np.column_stack([F[part], y[part, o]])])
-                    W[o] = np.linalg.solve(R[o][:d, :d], R[o][:d, d])
-            else:
-                descent_pass(F[part], y[part], rate, W)
-            if not np.all(np.isfinite(W)):
-                raise FloatingPointError(f"{method} diverged in pass {k + 1} near sample {first}: give a lower rate")
-            seconds.append(perf_counter() - began)
-            errors.append(_rms(y - F @ W.T))
-    curve = LearningCurve(method=method, seconds=np.array(seconds), training=np.array(errors))
-    return network.with_matrix(theta, W), curve
 
 
 def _rms(e: Array) -> float:

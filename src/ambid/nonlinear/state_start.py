@@ -1,29 +1,25 @@
-"""First weights of a state-space network: delay, subspace model, the thesis's training, and global search.
+"""First weights of a state-space network: delay, subspace model, and the thesis's training.
 
 PBSID-opt, for any stability and feedback, is turned into the network's states: outputs, and rates (``one-axis``, matrix
-logarithm) or differences (``free``). Else differential evolution searches free entries of A (log size, sign): over
-short shots, where unstable plants' costs are finite, first state, B and constants are linear (Golub and Pereyra 1973).
+logarithm) or differences (``free``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError, counted
-from ambid.estimation.global_search import STAGE, GlobalFound, global_search
 from ambid.estimation.linear import triangle_of
-from ambid.estimation.predictor import noise_floor
-from ambid.estimation.progress import Tick, guessed, silent
+from ambid.estimation.progress import Tick, guessed
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.records import Scaled
 from ambid.nonlinear.state_network import ONE_AXIS, Layout
-from ambid.nonlinear.state_training import State, add_gain, best_of, shift_inputs, train
+from ambid.nonlinear.state_training import State, add_gain, shift_inputs, train
 from ambid.signals.delay import find_delay as delay
 
 NO_START = "no starting network stays finite on these records: check the columns for their size and for jumps"
@@ -35,12 +31,6 @@ _MOST = 5000  # samples that the first guess looks at
 _SHORT = 5  # iterations of a short training
 _WORTH = 2.0  # gain of the log likelihood, times two, for which a neighbour is taken
 _TRAINED = 3000  # samples that short trainings look at
-
-_SHOT = 128  # samples
-_SHOTS = 8192  # samples of a record that are cut into shots
-_DECADES = 4.5  # that rates may span, from the Nyquist frequency down
-_TRIED = 3  # members of the last generation that are tried as starts
-_PROCESS = (1e-8, 1e-5, 1e-2)  # variance of process noise over that of the states' steps, tried for the gain
 
 # --- subspace models -------------------------------------------------------------------------------------------------
 
@@ -248,139 +238,3 @@ def train_one_step(
         M = (w * back[:, None] * size).T
         matrices[name] = matrices_json(layout, M[:, :n], M[:, n:-1], sampled=layout.form == "one-axis")
     return (descent, gauss_newton), matrices
-
-
-# --- global search ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ShotCost:
-    """Cost of the free entries of A over short shots, everything linear solved for."""
-
-    layout: Layout  # form ``one-axis``
-    Y: Array  # (n_shots, n_samples, n_outputs), outputs over their noise
-    u: Array  # (n_shots, n_samples)
-    noise: Array  # (n_outputs,), outputs' noise, scaled
-
-    @property
-    def searched(self) -> list[tuple[int, int]]:
-        """Entries of A that are free."""
-        return [(r, c) for r, c in self.layout.entries if c < 3]
-
-    @property
-    def fastest(self) -> float:
-        """Largest rate that is looked for, 1/s: a decay within a sample."""
-        return 2.0 / self.layout.dt
-
-    def entries(self, z: Array) -> Array:
-        """Return rates in 1/s from numbers in -1 .. 1: sign, and logarithm of the size."""
-        whole = _DECADES * np.log(10.0)
-        out: Array = self.fastest * np.sinh(whole * z) / np.sinh(whole)
-        return out
-
-    def __call__(self, z: Array) -> float:
-        """Return the logarithm of the determinant of the errors' covariance; infinite where numbers overflow."""
-        solution = self.solve(z)
-        return np.inf if solution is None else solution[1]
-
-    def solve(self, z: Array) -> tuple[Array, float, Array] | None:
-        """Return all weights, the cost, and the errors' covariance, all scaled."""
-        from scipy.linalg import expm, toeplitz
-
-        layout, (S, N, p) = self.layout, self.Y.shape
-        theta = np.zeros(layout.n_theta)
-        a = dict(zip(self.searched, self.entries(z), strict=True))
-        for k, at in enumerate(layout.entries):
-            theta[k] = a.get(at, 0.0)
-        linear = [(k, r, c) for k, (r, c) in enumerate(layout.entries) if c >= 3]
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            block = np.zeros((6, 6))
-            block[:3, :3], block[:3, 3:] = layout.weights(theta)[:, :3], np.eye(3)
-            sampled = expm(block * layout.dt)
-            if not np.all(np.isfinite(sampled)):
-                return None
-            powers = np.empty((N, 3, 3))  # from the first state to the outputs of each sample
-            powers[0] = np.eye(3)
-            for t in range(1, N):
-                powers[t] = powers[t - 1] @ sampled[:3, :3]
-            visible = powers[:, list(layout.heads)] / self.noise[:, None]
-            if not np.all(np.isfinite(visible)) or np.max(np.abs(visible)) > 1e100:
-                return None
-            O = visible.reshape(N * p, 3)  # noqa: E741
-            Q = np.linalg.qr(O / np.maximum(np.linalg.norm(O, axis=0), 1e-300))[0]
-            columns = []
-            for _, r, c in linear:
-                h = np.vstack([np.zeros((1, p)), visible[:-1] @ sampled[:3, 3 + r]])
-                if c == 4:
-                    columns.append(np.broadcast_to(np.cumsum(h, axis=0), (S, N, p)))
-                else:
-                    columns.append(np.stack([self.u @ toeplitz(h[:, o], np.zeros(N)).T for o in range(p)], axis=2))
-            flat = [x.reshape(S, N * p) for x in (self.Y, *columns)]
-            target, *forced = (x - (x @ Q) @ Q.T for x in flat)
-            F = np.stack([x.ravel() for x in forced], axis=1)
-            if not np.all(np.isfinite(F)):
-                return None
-            size = np.maximum(np.linalg.norm(F, axis=0), 1e-300)
-            weights = np.linalg.lstsq(F / size, target.ravel(), rcond=1e-10)[0] / size
-            left = (target.ravel() - F @ weights).reshape(S * N, p)
-        for (k, _, _), w in zip(linear, weights, strict=True):
-            theta[k] = w
-        noise = left.T @ left / (S * N)
-        if not np.all(np.isfinite(noise)):
-            return None
-        return theta, float(np.linalg.slogdet(noise + 1e-12 * np.eye(p))[1]), noise * self.noise[:, None] * self.noise
-
-
-def shot_cost(data: Scaled, dt: float, heads: tuple[int, ...]) -> ShotCost:
-    """Cut records into short shots; `heads` are the states (position, velocity, current) that outputs are."""
-    shortest = min(y.shape[0] for y, _ in data.parts)
-    length = max(min(_SHOT, shortest // 3), 8)
-    Y, u = [], []
-    for y, v in data.parts:
-        last = min(y.shape[0], max(_SHOTS // len(data.parts), length)) // length * length
-        Y.append(y[:last].reshape(-1, length, y.shape[1]))
-        u.append(v[:last, 0].reshape(-1, length))
-    # a velocity of the size that entries of A then have in the middle of what is searched
-    layout = one_axis_layout(data, dt, heads, 2.0 / dt * 10.0 ** (-_DECADES / 2.0), np.zeros((3, 5)))
-    noise = np.maximum(noise_floor(np.concatenate([y for y, _ in data.parts])), 1e-9)
-    return ShotCost(layout=layout, Y=np.concatenate(Y) / noise, u=np.concatenate(u), noise=noise)
-
-
-def search_start(
-    data: Scaled, dt: float, heads: tuple[int, ...], *, seed: int, evaluations: int, tick: Tick = silent
-) -> tuple[State | None, GlobalFound]:
-    """Search globally for a ``one-axis`` network with gain that runs on the records; no state where no gain keeps it
-    finite.
-    """
-    cost = shot_cost(data, dt, heads)
-    n = len(cost.searched)
-    result = global_search(
-        cost, -np.ones(n), np.ones(n), seed=[seed, 5], evaluations=evaluations, tick=tick, stage=STAGE
-    )
-    return best_of(_add_kalman_gain(cost, z, data) for z in (result.vector, *result.best[1:_TRIED])), result
-
-
-def _add_kalman_gain(cost: ShotCost, z: Array, data: Scaled) -> State | None:
-    """The network with the Kalman gain of a guessed process noise, the best of several guesses."""
-    from scipy.linalg import solve_discrete_are
-
-    solved = cost.solve(z)
-    if solved is None:
-        return None
-    theta, _, noise = solved
-    layout = replace(
-        cost.layout, rates=tuple(float(np.linalg.norm(cost.layout.weights(theta)[r, :4])) or 1.0 for r in (1, 2))
-    )
-    bare = State.of(layout, theta, data)
-    m: Any = layout.matrices(theta)
-    C = np.eye(3)[list(layout.heads)]
-    step = np.maximum(np.abs(m.A - np.eye(3)).sum(axis=1), 1e-9) ** 2
-
-    def kalman(q: float) -> State | None:
-        try:
-            P = solve_discrete_are(m.A.T, C.T, q * np.diag(step), noise + 1e-12 * np.eye(layout.p))
-            return add_gain(bare, data, np.linalg.solve(C @ P @ C.T + noise, C @ P @ m.A.T).T)
-        except (np.linalg.LinAlgError, ValueError):
-            return None
-
-    return best_of(map(kalman, _PROCESS))

@@ -215,15 +215,11 @@ def test_feedback_is_warned_of_and_nothing_to_predict_from_refused() -> None:
     assert not any("feedback" in w for w in rbf([record], {"neurons": 4}).warnings)
     with pytest.raises(EstimationError, match="nothing is left"):
         rbf([record], {"ny": 0, "nu": 0})
-    with pytest.raises(EstimationError, match="recursive"):
-        rbf([record], {"training": "recursiv"})
 
 
 @pytest.mark.parametrize(
     ("told", "word"),
     [
-        ({"training": "descent", "rate": 0.0}, "rate"),
-        ({"training": "descent", "trained": "all"}, "trained = all"),
         ({"held_out": 0.0}, "held_out"),
         ({"held_out": 0.0, "ny": 1, "nu": 1, "neurons": 3}, "width"),
     ],
