@@ -23,30 +23,20 @@ def noisy(G, share, seed=1):
     return G + share * np.abs(G) * (rng.standard_normal(G.shape) + 1j * rng.standard_normal(G.shape)) / np.sqrt(2)
 
 
-def uff(functions, *, binary=False, double=True, even=True, order="<"):
+def uff(functions, *, double=True, even=True):
     """Bytes of a universal file; `functions`: of (kind, output node, input node, f, values, units)."""
-    return b"".join(_dataset(*one, binary, double, even, order) for one in functions)
+    return b"".join(_dataset(*one, double, even) for one in functions)
 
 
-def _dataset(kind, response, reference, f, values, units, binary, double, even, order):
+def _dataset(kind, response, reference, f, values, units, double, even):
     complex_ = np.iscomplexobj(values)
     form = (6 if double else 5) if complex_ else (4 if double else 2)
     columns = [values.real, values.imag] if complex_ else [values]
-    if binary:
-        cell = f"{order}f{8 if double else 4}"
-        parts = [("x", f"{order}f4")] * (not even) + [(str(k), cell) for k in range(len(columns))]
-        rows = np.zeros(f.size, dtype=parts)
-        for k, x in enumerate([*([] if even else [f]), *columns]):
-            rows[rows.dtype.names[k]] = x
-        body = rows.tobytes()
-        head = f"    58b{1 if order == '<' else 2:6d}     2{11:12d}{len(body):12d}     0     0{0:12d}{0:12d}"
-    else:
-        flat = np.column_stack([*([] if even else [f]), *columns]).ravel()
-        body = "".join(f"{x:20.11e}" + "\n" * (k % 4 == 3) for k, x in enumerate(flat)).encode() + b"\n"
-        head = "    58"
+    flat = np.column_stack([*([] if even else [f]), *columns]).ravel()
+    body = "".join(f"{x:20.11e}" + "\n" * (k % 4 == 3) for k, x in enumerate(flat)).encode() + b"\n"
     axes = [(18, "Hz"), (8, units[0]), (13, units[1]), (0, "NONE")]
     lines = [
-        head, *["made by a test"] * 5,
+        "    58", *["made by a test"] * 5,
         f"{kind:5d}{0:10d}{0:5d}{0:10d} {'NONE':10s}{response:10d}{3:4d} {'NONE':10s}{reference:10d}{3:4d}",
         f"{form:10d}{f.size:10d}{int(even):10d}{f[0] if even else 0:13.5e}{f[1] - f[0] if even else 0:13.5e}{0:13.5e}",
         *[f"{code:10d}    0    0    0 {'NONE':20s} {text:20s}" for code, text in axes],

@@ -1,4 +1,4 @@
-"""Frequency responses from CSV and universal files (UFF, UNV), dataset 58, ASCII and binary (SDRC, Universal File
+"""Frequency responses from CSV and universal files (UFF, UNV), dataset 58 in ASCII (SDRC, Universal File
 Datasets Summary). Units are those of the axis labels; without one, of the quantity where dataset 164 says SI.
 """
 
@@ -392,12 +392,12 @@ def read_uff(path: Path, data: bytes, words: Mapping[str, str]) -> tuple[list[Fu
     functions: list[Function] = []
     coherence: dict[tuple[str, str], Array] = {}
     left, system = 0, 0
-    for number, body, binary in _datasets(path, data):
+    for number, body in _datasets(path, data):
         if number == 164:
             system = int(body[0][:10])
         if number != 58:
             continue
-        kind, function = _function(path, body, binary, len(functions) + left + 1, system, words)
+        kind, function = _function(path, body, len(functions) + left + 1, system, words)
         if kind == _COHERENCE:
             coherence[function.output, function.input] = function.values.real
         elif kind in _FRF:
@@ -407,8 +407,8 @@ def read_uff(path: Path, data: bytes, words: Mapping[str, str]) -> tuple[list[Fu
     return [replace(f, coherence=coherence.get((f.output, f.input))) for f in functions], left
 
 
-def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple[str, bytes] | None]]:
-    """Yield number, lines and, of a binary one, byte order with the bytes behind its first lines."""
+def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
+    """Yield number and lines of each dataset."""
     at, count = 0, 0
     while True:
         begin = re.compile(rb"^ {4}-1[ \t]*\r?\n", re.M).search(data, at)
@@ -420,39 +420,18 @@ def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple
             at = begin.end()
             continue
         count += 1
+        if head[6:7].lower() == "b":
+            raise RecordError(f"{path}: dataset {count} is binary (58b), which is not read. Export it as ASCII")
         try:
-            number, binary = int(head[:6]), head[6:7].lower() == "b"
-            order, form, n_lines, size = (
-                (int(head[a:b]) for a, b in ((7, 13), (13, 19), (19, 31), (31, 43))) if binary else (0,) * 4
-            )
+            number = int(head[:6])
         except ValueError:
             raise RecordError(
                 f"{path}: dataset {count} begins with {head[:40]!r}, not with its number. It is damaged"
             ) from None
-        if binary:
-            if order not in (1, 2) or form != 2:
-                raise RecordError(f"{path}: dataset {count} is binary in a form that is not IEEE. Export it as ASCII")
-            cut = end_of_head + 1
-            for _ in range(n_lines):
-                cut = data.find(b"\n", cut) + 1
-                if cut == 0:
-                    raise RecordError(f"{path}: dataset {count} ends within its head: it is cut off. Copy it again")
-            lines = data[end_of_head + 1 : cut].splitlines()
-            # writers announce wrong sizes of complex values: the end that follows decides
-            sizes = [size, *_sizes(lines)]
-            ends = [k for k in sizes if re.match(rb"[\r\n]*[ ]*-1\s", data[cut + k : cut + k + 12] + b"\n")]
-            if not ends:
-                raise RecordError(
-                    f"{path}: dataset {count} is cut off or damaged: no end after its {size} bytes. Copy it again"
-                )
-            block = data[cut : cut + ends[0]]
-            at = data.find(b"-1", cut + ends[0]) + 2
-            yield number, lines, ("<" if order == 1 else ">", block)
-            continue
         end = re.compile(rb"^ {4}-1[ \t]*\r?$", re.M).search(data, end_of_head + 1)
         if end is None:
             raise RecordError(f"{path}: dataset {count} has no end (a line -1): it is cut off. Copy it again")
-        yield number, data[end_of_head + 1 : end.start()].splitlines(), None
+        yield number, data[end_of_head + 1 : end.start()].splitlines()
         at = end.end()
     if not count:
         raise RecordError(
@@ -460,20 +439,9 @@ def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple
         )
 
 
-def _sizes(lines: Sequence[bytes]) -> list[int]:
-    """Return the bytes that a binary function needs by its head; abscissas are in single precision, or as the rest."""
-    try:
-        form, n, even = (int(lines[6][a : a + 10]) for a in (0, 10, 20))
-    except (ValueError, IndexError):
-        return []
-    value = {2: 4, 4: 8, 5: 8, 6: 16}.get(form, 0)
-    return [n * value] if even else [n * (value + 4), n * (value + (8 if form in (4, 6) else 4))]
-
-
 def _function(
-    path: Path, body: Sequence[bytes], binary: tuple[str, bytes] | None, count: int, system: int,
-    words: Mapping[str, str],
-) -> tuple[int, Function]:  # fmt: skip
+    path: Path, body: Sequence[bytes], count: int, system: int, words: Mapping[str, str]
+) -> tuple[int, Function]:
     """Read a function of dataset 58: records 6 to 12."""
     where = f"{path}: function {count}"
     lines = [x.decode("latin-1").ljust(80) for x in body[:11]]
@@ -491,7 +459,7 @@ def _function(
         raise RecordError(f"{where}: data type {form} or {n} values are none of dataset 58. It is damaged")
     if kind in _FRF and form not in (5, 6):
         raise RecordError(f"{where} is real; a frequency response has a phase. Export it complex")
-    x, values = _values(where, body[11:], binary, form, n, bool(even))
+    x, values = _values(where, body[11:], form, n, bool(even))
     frequency = np.asarray(first + step * np.arange(n) if x is None else x, dtype=np.float64)
     over = axes[0][1] or "Hz"
     if kind in _FRF and (axes[0][0] not in (0, 18) or over not in ("Hz", "kHz", "rad/s", "NONE")):
@@ -528,27 +496,16 @@ def _dof(text: str) -> str:
     return label if label and node == 0 and direction == 0 else f"{label} {point}".strip()
 
 
-def _values(
-    where: str, body: Sequence[bytes], binary: tuple[str, bytes] | None, form: int, n: int, even: bool
-) -> tuple[Array | None, Complex]:
+def _values(where: str, body: Sequence[bytes], form: int, n: int, even: bool) -> tuple[Array | None, Complex]:
     """Return abscissas where they are given, and the values."""
     pair = 2 if form in (5, 6) else 1
     width = pair if even else pair + 1
-    if binary is None:
-        text = b"\n".join(body)
-        numbers = _NUMBER.findall(text)
-        if _NUMBER.sub(b"", text).strip():
-            bad = _NUMBER.sub(b"", text).split()[0].decode("latin-1")
-            raise RecordError(f"{where}: {bad[:20]!r} among its values is not a number. It is damaged: export it again")
-        flat = np.array([float(x.replace(b"D", b"E").replace(b"d", b"e")) for x in numbers])
-    else:
-        order, block = binary
-        size = 8 if form in (4, 6) else 4
-        if not even and size == 8 and len(block) == n * (4 + 8 * pair):  # abscissas in single precision
-            mixed = np.frombuffer(block, np.dtype([("x", f"{order}f4"), ("y", f"{order}f8", (pair,))]))
-            flat = np.column_stack([mixed["x"], mixed["y"]]).astype(np.float64).ravel()
-        else:
-            flat = np.frombuffer(block[: len(block) // size * size], f"{order}f{size}").astype(np.float64)
+    text = b"\n".join(body)
+    numbers = _NUMBER.findall(text)
+    if _NUMBER.sub(b"", text).strip():
+        bad = _NUMBER.sub(b"", text).split()[0].decode("latin-1")
+        raise RecordError(f"{where}: {bad[:20]!r} among its values is not a number. It is damaged: export it again")
+    flat = np.array([float(x.replace(b"D", b"E").replace(b"d", b"e")) for x in numbers])
     if flat.size != n * width:
         raise RecordError(
             f"{where} has {flat.size} of {n * width} numbers that its head announces: it is cut off. Copy it again"
