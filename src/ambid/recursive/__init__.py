@@ -13,10 +13,7 @@ if TYPE_CHECKING:
     from ambid.recursive.joint import JointUkf as JointUkf
     from ambid.recursive.kalman import KalmanFilter as KalmanFilter
     from ambid.recursive.kalman import LinearState as LinearState
-    from ambid.recursive.kalman import PassiveLowpass as PassiveLowpass
-    from ambid.recursive.kalman import ScalarKalman as ScalarKalman
     from ambid.recursive.kalman import constant_velocity as constant_velocity
-    from ambid.recursive.kalman import kalman_bucy_gain as kalman_bucy_gain
     from ambid.recursive.kalman import linear_state as linear_state
     from ambid.recursive.lines import Event as Event
     from ambid.recursive.lines import Track as Track

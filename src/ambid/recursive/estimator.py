@@ -7,7 +7,6 @@ from __future__ import annotations
 from copy import deepcopy
 from functools import cache
 from importlib import import_module
-from math import isfinite
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -136,14 +135,6 @@ def _rows(values: Array, n: int, width: int) -> Array:
     if rows.dtype == np.float64 and rows.flags.carray:  # what follows takes as long as the use of one sample
         return rows
     return np.require(rows, np.float64, ["C", "W"])
-
-
-def check_channels(name: str, rate_hz: float, channels: int) -> None:
-    """Refuse a rate that is not positive or a number of channels that is none; `name` is for the message."""
-    if not (isfinite(rate_hz) and rate_hz > 0):
-        raise EstimationError(f"{name}: the rate is {rate_hz} Hz; it must be positive. Give the sampling rate")
-    if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
-        raise EstimationError(f"{name}: {channels!r} channels; give a whole number from 1 up")
 
 
 def positive(name: str, value: float) -> float:

@@ -1,18 +1,17 @@
-"""Kalman filters over the square-root core, for samples and blocks with gaps: of a linear state x⁺ = A x + B u + w, y =
-C x + v, and the stationary scalar Kalman-Bucy filter (thesis eq. 5.3), fed with held samples as the passive low-pass.
+"""Kalman filter over the square-root core, for samples and blocks with gaps, of a linear state x⁺ = A x + B u + w, y =
+C x + v.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, expm1, isfinite, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import Copied, as_block, check_channels, covariance_of, factors_of, kernels, root_of
+from ambid.recursive.estimator import Copied, as_block, covariance_of, factors_of, kernels, root_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,9 +99,10 @@ def constant_velocity(rate_hz: float, *, q: float, r: float) -> LinearState:
     EstimationError
         If a number is not positive.
     """
-    check_channels("constant velocity", rate_hz, 1)
-    if not (0 < q < np.inf and 0 < r < np.inf):
-        raise EstimationError(f"constant velocity: q = {q:g}, r = {r:g}; both must be positive. Give others")
+    if not all(0 < x < np.inf for x in (rate_hz, q, r)):
+        raise EstimationError(
+            f"constant velocity: rate {rate_hz:g} Hz, q = {q:g}, r = {r:g}; all must be positive. Give others"
+        )
     T = 1.0 / rate_hz
     return linear_state(
         [[1.0, T], [0.0, 1.0]], [[1.0, 0.0]], q * np.array([[T**3 / 3, T**2 / 2], [T**2 / 2, T]]), [[r]]
@@ -246,155 +246,3 @@ def _start_covariance(model: LinearState, covariance: ArrayLike | None) -> Array
             "Kalman filter: start_covariance is not positive definite. Give every state a positive variance"
         ) from None
     return P
-
-
-class StreamingFilter(Copied):
-    """A first-order filter x⁺ = decay x + forward y on each of several channels; cutting the stream differently changes
-    no number. `first` is the state over the first value, where none is given; a value that is not finite is missing,
-    counted in `n_missing`: x⁺ = alone x.
-    """
-
-    def __init__(
-        self, name: str, channels: int, start: float | None, *, decay: float, forward: float, alone: float, first: float
-    ) -> None:
-        self.name, self.channels = name, channels
-        self.n_samples = self.n_missing = 0
-        self._state = np.full(channels, np.nan if start is None else float(start))
-        self._constants = np.array([decay, forward, alone, first])
-
-    @property
-    def state(self) -> Array:
-        """A copy of the estimate that is ready for the next sample, shape (channels,)."""
-        return self._state.copy()
-
-    def update(self, measurement: ArrayLike) -> Array | float:
-        """Return one sample (channels,), or a block (n_samples, channels), filtered."""
-        y = np.asarray(measurement, dtype=np.float64)
-        block = as_block(y, self.channels, self.name)
-        out = np.empty(block.shape)
-        self.n_missing += kernels("kalman").hold_scan(block, out, self._state, self._constants)
-        self.n_samples += block.shape[0]
-        return float(out[0, 0]) if y.ndim == 0 else out.reshape(y.shape)
-
-
-def kalman_bucy_gain(*, a: float = 0.0, c: float = 1.0, w: float = 1.0, q: float = 60.0, r: float = 1.0) -> float:
-    """Return the stationary gain L = S C/R of the scalar filter.
-
-    S is the positive root of the Riccati equation 2 A S - S² C²/R + W² Q = 0 (thesis 5.3.2, with W Q Wᵀ where it
-    prints W Q Cᵀ). The defaults are the thesis's: L = √60 = 7.746 1/s.
-
-    Parameters
-    ----------
-    a : float
-        A in 1/s.
-    c : float
-        C, unit of the measurement per unit of the state; not 0.
-    w : float
-        W, unit of the state per second and unit of w.
-    q : float
-        Intensity (two-sided density) of w, its unit squared times s; at least 0.
-    r : float
-        Intensity of the measurement noise, its unit squared times s; over 0. White noise of variance σ² sampled at f
-        Hz has σ²/f.
-
-    Returns
-    -------
-    float
-        L in state unit per measurement unit and second.
-
-    Raises
-    ------
-    EstimationError
-        If C is 0, Q negative or R not positive, or A and W² Q are both 0 (the stationary gain would be 0).
-    """
-    for label, value in {"A": a, "C": c, "W": w, "Q": q, "R": r}.items():
-        if not isfinite(value):
-            raise EstimationError(f"Kalman-Bucy filter: {label} is {value}; it must be finite. Give a number")
-    if c == 0.0 or q < 0.0 or r <= 0.0:
-        raise EstimationError(
-            f"Kalman-Bucy filter: C = {c:g}, Q = {q:g}, R = {r:g}; C must not be 0, Q not negative and R positive. "
-            "Give others"
-        )
-    if a == 0.0 and w * w * q == 0.0:
-        raise EstimationError(
-            "Kalman-Bucy filter: A = 0 without process noise has no stationary gain but 0. Give Q > 0"
-        )
-    s = (a + sqrt(a * a + c * c * w * w * q / r)) * r / (c * c)
-    return s * c / r
-
-
-class ScalarKalman(StreamingFilter):
-    """Stationary Kalman-Bucy filter of one or several channels that have nothing to do with each other.
-
-    x̂' = A x̂ + L (y - C x̂) is solved exactly, y held over a sample; what comes out is x̂ at the sampling instants,
-    from the samples before. The defaults are the thesis's (5.3.2): A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 =
-    7.746 1/s. `KalmanFilter` has the discrete and the varying form.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Sampling rate in Hz.
-    a, c, w, q, r : float
-        As in `kalman_bucy_gain`: intensities, not variances of samples; r = σ²/f of white noise.
-    start : float, optional
-        Estimate before the first sample; y/c of the first sample by default.
-    channels : int
-
-    Raises
-    ------
-    EstimationError
-        If a number is out of range, or there is no stationary filter.
-    """
-
-    def __init__(
-        self,
-        rate_hz: float,
-        *,
-        a: float = 0.0,
-        c: float = 1.0,
-        w: float = 1.0,
-        q: float = 60.0,
-        r: float = 1.0,
-        start: float | None = None,
-        channels: int = 1,
-    ) -> None:
-        check_channels("scalar Kalman filter", rate_hz, channels)
-        self.gain = kalman_bucy_gain(a=a, c=c, w=w, q=q, r=r)
-        pole = a - self.gain * c
-        super().__init__(
-            "scalar Kalman filter", channels, start,
-            decay=exp(pole / rate_hz), forward=self.gain * expm1(pole / rate_hz) / pole, alone=exp(a / rate_hz),
-            first=1.0 / c,
-        )  # fmt: skip
-
-
-class PassiveLowpass(StreamingFilter):
-    """First-order RC low-pass, x' = (y - x)/τ with τ = 1/(2π corner), discretised exactly; y held over a sample.
-
-    Gives the voltage over the capacitor at the sampling instants. Over a missing value it stays where it is.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Sampling rate in Hz.
-    corner_hz : float
-        Frequency of -3 dB in Hz, over 0.
-    start : float, optional
-        Value before the first sample; the first sample by default.
-    channels : int
-
-    Raises
-    ------
-    EstimationError
-        If a number is not positive.
-    """
-
-    def __init__(self, rate_hz: float, *, corner_hz: float, start: float | None = None, channels: int = 1) -> None:
-        check_channels("passive low-pass", rate_hz, channels)
-        if not (isfinite(corner_hz) and corner_hz > 0):
-            raise EstimationError(f"passive low-pass: the corner is {corner_hz} Hz; it must be positive. Give another")
-        self.corner_hz = corner_hz
-        step = -2.0 * pi * corner_hz / rate_hz
-        super().__init__(
-            "passive low-pass", channels, start, decay=exp(step), forward=-expm1(step), alone=1.0, first=1.0
-        )

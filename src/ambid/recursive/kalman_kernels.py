@@ -25,31 +25,6 @@ _BLIND = 32  # samples without any output after which the state is taken for los
 
 
 @compiled(fastmath={"contract"})
-def hold_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
-    """x+ = decay x + forward y, output x before y; over a missing y, x+ = alone x; return how many were missing.
-    `state` (m,) is NaN where none is given: the first value then gives it.
-    """
-    decay, forward, alone, first = constants
-    missing = 0
-    for j in range(y.shape[1]):
-        x = state[j]
-        begun = isfinite(x)
-        for k in range(y.shape[0]):
-            v = y[k, j]  # before out, which may be the same array
-            seen = isfinite(v)
-            if seen and not begun:
-                x, begun = first * v, True
-            out[k, j] = x
-            if seen:
-                x = decay * x + forward * v
-            else:
-                x *= alone
-                missing += 1
-        state[j] = x
-    return missing
-
-
-@compiled(fastmath={"contract"})
 def state_scan(y: Array, u: Array, out: Array, model: Array, memory: Array, work: Array, tally: Array) -> None:
     """Run a Kalman filter output by output, what their noises share taken off first. `model`: A, B, C, G with G Gᵀ = Q,
     and R; `memory`: factors of the covariance, predicted state, what `_correct` keeps; `tally`: whether the covariance
