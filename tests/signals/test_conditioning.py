@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import RecordError
-from ambid.signals import cut, lowpass, remove_offset, remove_trend, replace_samples, resample, scale
+from ambid.signals import cut, lowpass, remove_trend, replace_samples
 
 RATE = 1000.0
 T = np.arange(4000) / RATE
@@ -16,18 +16,10 @@ def sine(hz: float) -> np.ndarray:
     return np.sin(2 * np.pi * hz * T)
 
 
-def test_offset_is_the_mean_and_goes_into_the_history(make):
-    r = remove_offset(make(RATE, x=sine(5) + 3.0, y=sine(5) - 1.0), "x")
-    assert abs(np.mean(r["x"])) < 1e-15
-    np.testing.assert_array_equal(r["y"], sine(5) - 1.0)
-    assert r.history[0].name == "remove_offset"
-    assert r.history[0].settings["x"] == pytest.approx(3.0)
-
-
 def test_the_record_given_is_not_changed(make):
     r = make(RATE, x=sine(5) + 3.0)
     before = r["x"].values.copy()
-    for step in (remove_offset, remove_trend, lambda q: lowpass(q, 50.0), lambda q: resample(q, 500.0)):
+    for step in (remove_trend, lambda q: lowpass(q, 50.0)):
         step(r)
     np.testing.assert_array_equal(r["x"], before)
     assert r.history == ()
@@ -73,29 +65,6 @@ def test_values_that_are_not_finite_are_refused_by_place(make, bad):
         lowpass(make(RATE, x=x), 50.0)
 
 
-@pytest.mark.parametrize(("rate", "n"), [(500.0, 2000), (250.0, 1000), (400.0, 1600)])
-def test_resampling_keeps_the_band_in_time_and_removes_what_would_alias(make, rate, n):
-    r = resample(make(RATE, x=sine(20) + sine(450)), rate)
-    assert (r.rate_hz, r.n_samples) == (rate, n)
-    middle = slice(n // 8, -n // 8)
-    assert np.max(np.abs(r["x"] - np.sin(2 * np.pi * 20 * r.time_s))[middle]) < 0.01
-    assert r.history[0].settings["to_hz"] == rate
-
-
-def test_resampling_keeps_a_constant(make):
-    np.testing.assert_allclose(resample(make(RATE, x=np.full(3000, 7.0)), 300.0)["x"], 7.0, rtol=1e-12)
-
-
-def test_upsampling_is_refused(make):
-    with pytest.raises(RecordError, match="adds samples but no information"):
-        resample(make(RATE, x=sine(20)), 2000.0)
-
-
-def test_resampling_to_an_irrational_ratio_is_refused(make):
-    with pytest.raises(RecordError, match="fraction"):
-        resample(make(RATE, x=sine(20)), 1000.0 / np.pi)
-
-
 def test_cut_takes_from_inclusive_to_exclusive_on_the_records_clock(make):
     r = cut(make(RATE, x=T), 2.0, 3.0)
     assert (r.n_samples, r.start_s) == (1000, 2.0)
@@ -110,18 +79,6 @@ def test_cut_takes_from_inclusive_to_exclusive_on_the_records_clock(make):
 def test_cut_outside_or_empty_is_refused(make, ends):
     with pytest.raises(RecordError, match="cut"):
         cut(make(RATE, x=T), *ends)
-
-
-def test_scale_changes_values_and_unit(make):
-    r = scale(make(RATE, x=T, y=T), "x", -2.0, offset=1.0, unit="A")
-    np.testing.assert_array_equal(r["x"], 1.0 - 2.0 * T)
-    assert (r.channel("x").unit, r.channel("y").unit) == ("A", "V")
-
-
-@pytest.mark.parametrize("gain", [0.0, float("nan"), float("inf")])
-def test_scale_by_nothing_is_refused(make, gain):
-    with pytest.raises(RecordError, match="gain"):
-        scale(make(RATE, x=T), "x", gain)
 
 
 def test_replacing_samples_of_a_line_restores_it_and_repairs_nan(make):
@@ -153,4 +110,4 @@ def test_replacing_nothing_adds_no_history(make):
 
 def test_an_unknown_channel_is_named(make):
     with pytest.raises(RecordError, match="'z'"):
-        remove_offset(make(RATE, x=T), "z")
+        remove_trend(make(RATE, x=T), "z")

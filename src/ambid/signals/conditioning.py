@@ -1,11 +1,9 @@
-"""Steps on a record before it is used: cut, scale, replace samples, remove offset and trend, filter, resample."""
+"""Steps on a record before it is used: replace samples, remove a trend, filter."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,40 +54,6 @@ def equal_runs(values: Array) -> tuple[np.ndarray, np.ndarray]:
     """Return starts and lengths of the runs of exactly equal samples that make up `values`."""
     starts = np.concatenate(([0], np.flatnonzero(np.diff(values)) + 1))
     return starts, np.diff(np.concatenate((starts, [values.size])))
-
-
-def scale(record: Record, name: str, gain: float, *, offset: float = 0.0, unit: str | None = None) -> Record:
-    """Replace a channel's values by gain·values + offset.
-
-    Parameters
-    ----------
-    record : Record
-    name : str, a channel
-    gain : float, not zero, in new unit per old unit
-    offset : float, in the new unit
-    unit : str, optional
-        SI unit of the result; unchanged by default.
-
-    Returns
-    -------
-    Record, a new one with the step in its history
-
-    Raises
-    ------
-    RecordError
-        If the channel does not exist, or gain or offset is not a usable number.
-    """
-    old = record.channel(name)
-    if not (math.isfinite(gain) and gain != 0.0 and math.isfinite(offset)):
-        raise RecordError(
-            f"scale of channel {name!r} by gain {gain} and offset {offset}; both must be finite and the gain not "
-            f"0. Give other numbers"
-        )
-    new = replace(old, values=gain * old.values + offset, unit=old.unit if unit is None else unit)
-    settings = {"channel": name, "gain": float(gain), "offset": float(offset), "unit": new.unit}
-    return record.with_step(
-        Step(name="scale", settings=settings), channels=tuple(new if c is old else c for c in record.channels)
-    )
 
 
 def replace_samples(record: Record, name: str, indices: Sequence[int] | NDArray[np.intp]) -> Record:
@@ -144,30 +108,6 @@ def replace_samples(record: Record, name: str, indices: Sequence[int] | NDArray[
         Step(name="replace_samples", settings=settings),
         channels=tuple(replace(c, values=values) if c is old else c for c in record.channels),
     )
-
-
-def remove_offset(record: Record, names: str | Sequence[str] | None = None) -> Record:
-    """Subtract each channel's mean.
-
-    Parameters
-    ----------
-    record : Record
-    names : str or sequence of str, optional
-        Channels; all of them by default.
-
-    Returns
-    -------
-    Record, a new one
-        Its history holds the removed means, in each channel's unit.
-
-    Raises
-    ------
-    RecordError
-        If a channel does not exist or holds a value that is not finite.
-    """
-    which = chosen(record, names)
-    means = {n: float(np.mean(finite(record, n))) for n in which}
-    return mapped(record, which, Step(name="remove_offset", settings=means), lambda x: x - np.mean(x))
 
 
 def remove_trend(record: Record, names: str | Sequence[str] | None = None, *, degree: int = 1) -> Record:
@@ -264,57 +204,3 @@ def zero_phase(x: Array, rate_hz: float, corner_hz: float, *, order: int) -> Arr
     sections = butter(order, corner_hz, fs=rate_hz, output="sos")
     filtered: Array = np.ascontiguousarray(sosfiltfilt(sections, x, padlen=padding))
     return filtered
-
-
-def resample(record: Record, rate_hz: float) -> Record:
-    """Lower the sampling rate of the whole record by a rational factor, with an anti-alias filter.
-
-    Polyphase linear-phase FIR (Kaiser window), compensated for its delay. A held input (steps, PRBS) is smeared over
-    the edges by the filter: identify at the measured rate where that matters.
-
-    Parameters
-    ----------
-    record : Record
-    rate_hz : float
-        New rate in Hz; its ratio to the present one must be a fraction with terms up to 1000.
-
-    Returns
-    -------
-    Record, a new one with the step in its history
-
-    Raises
-    ------
-    RecordError
-        If the rate is not positive, higher (that adds samples but no information), or not a rational multiple.
-    """
-    if not (np.isfinite(rate_hz) and rate_hz > 0):
-        raise RecordError(f"resample to {rate_hz} Hz; the rate must be a positive number of Hz. Give another rate")
-    if rate_hz > record.rate_hz:
-        raise RecordError(
-            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz adds samples but no information. Give a lower rate"
-        )
-    ratio = Fraction(rate_hz / record.rate_hz).limit_denominator(1000)
-    if ratio == 0 or ratio.numerator > 1000 or abs(float(ratio) * record.rate_hz / rate_hz - 1.0) > 1e-9:
-        raise RecordError(
-            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz is not a fraction with terms up to 1000. Give "
-            f"{float(ratio) * record.rate_hz:.10g} Hz or another multiple"
-        )
-    if record.n_samples * ratio < 2:
-        raise RecordError(f"resample to {rate_hz:g} Hz leaves less than two samples. Give a higher rate")
-    channels = tuple(replace(c, values=resampled(finite(record, c.name), ratio)) for c in record.channels)
-    step = Step(name="resample", settings={"from_hz": record.rate_hz, "to_hz": float(rate_hz), "ratio": str(ratio)})
-    return record.with_step(step, channels=channels, rate_hz=float(rate_hz))
-
-
-def resampled(x: Array, ratio: Fraction) -> Array:
-    """Return samples (ceil(n_samples * ratio),) at a new rate, `ratio` times the old one, by a polyphase anti-alias
-    filter; the first is at the same instant.
-    """
-    from scipy.signal import resample_poly
-
-    # Without the line through its ends the signal starts and ends at 0, as the filter assumes; and the line passes
-    # exactly.
-    slope = (x[-1] - x[0]) / max(x.size - 1, 1)
-    rest = resample_poly(x - (x[0] + slope * np.arange(x.size)), ratio.numerator, ratio.denominator)
-    values: Array = rest + x[0] + slope * np.arange(rest.size) / float(ratio)
-    return values
