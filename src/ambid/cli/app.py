@@ -65,7 +65,7 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "init": {"plot": "'ambid info RECORD --plot FILE.png'"},
     "history": {"export": "", "tables": "", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
     "design controller": {"method": "--kind", "export": "--law", "judges": "", "schedule": ""},
-    "design experiment": {"lines": ""},
+    "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "acquire": {"no-live": "", "quiet": ""},
     "track": {"reference": "", "start-seconds": "--start S", "no-live": "", "quiet": ""},

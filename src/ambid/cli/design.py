@@ -32,7 +32,7 @@ def experiment(v: Values) -> None:
     of = None if known is not None else Path(v.source)
     with Outputs(of, v.rig, **v.outputs) as outputs, progress("design") as show:
         outputs.claim(v.out, "out", (".csv", ".csv.gz", ".h5", ".hdf5"), force=v.force)
-        how = v.only("seconds period band criterion target use slew spread rate_hz closed seed")
+        how = v.only("seconds period band criterion target use spread rate_hz closed seed")
         found = design_experiment(known or v.source, v.rig, **how, tick=show)
         outputs.give(found, show)
         if v.out is not None:

@@ -149,7 +149,6 @@ def _search(
 # From rest the signals are those of the steady state less rows Zᵏ z(0), z(0) the state of the steady state where the
 # period begins: where that is small, the transient is.
 
-SLEW = ".slew"
 """What follows the name of an input in that of its rate of change."""
 _NOISE_LINES = 2048
 _STARTS = 24  # beginnings of the period that are simulated
@@ -158,7 +157,7 @@ _PERIODS = 2  # in which a transient is looked at
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExcitedLoop:
-    """A plant in its loop; signals: outputs, inputs, rates of change of the inputs."""
+    """A plant in its loop; signals: outputs, inputs."""
 
     plant: Plant
     loop: Loop
@@ -180,8 +179,7 @@ class ExcitedLoop:
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of the signals."""
-        plant_model = self.plant.model
-        return (*plant_model.outputs, *plant_model.inputs, *(f"{name}{SLEW}" for name in plant_model.inputs))
+        return (*self.plant.model.outputs, *self.plant.model.inputs)
 
     @property
     def pole(self) -> float:
@@ -199,8 +197,7 @@ class ExcitedLoop:
         T = self.states(lines, period, inputs) @ self.rows.T
         n_u = self.e.shape[1]
         T[:, -n_u:] += np.eye(n_u)[inputs]
-        back = (1.0 - np.exp(-2j * np.pi * lines / period)) * self.plant.rate_hz
-        return np.hstack([T, T[:, -n_u:] * back[:, None]])
+        return np.asarray(T)
 
     def decay(self, samples: int) -> Array:
         """Return what is left of a state, (samples, n_signals, n), by doubling."""
@@ -208,11 +205,7 @@ class ExcitedLoop:
         while rows.shape[0] < samples:
             rows = np.concatenate([rows, rows @ power])
             power = power @ power
-        rows, n_u = rows[:samples], self.e.shape[1]
-        inputs = rows[:, -n_u:]
-        slew = np.diff(inputs, axis=0, prepend=np.zeros((1, *inputs.shape[1:]))) * self.plant.rate_hz
-        slew[0] = 0.0
-        return np.concatenate([rows, slew], axis=1)
+        return rows[:samples]
 
     def noise_sd(self, noise: Innovation) -> Array:
         """Return the standard deviation that noise gives the signals as they are logged, (n_signals,)."""
@@ -221,8 +214,7 @@ class ExcitedLoop:
         H, K = self.plant.sampled(f).transfer(), controller_of_loop(self.loop, plant_model, rate).response(f)[0]
         V = np.asarray(np.linalg.inv(np.asarray(noise.whiten(self.plant, 2.0 * np.pi * f))))
         answer = -np.linalg.solve(np.eye(H.shape[2]) + K @ H, K @ V)
-        slew = answer * (rate * np.abs(1.0 - np.exp(-2j * np.pi * f / rate)))[:, None, None]
-        power = [np.mean(np.sum(np.abs(x) ** 2, axis=2), axis=0) for x in (H @ answer + V, answer, slew)]
+        power = [np.mean(np.sum(np.abs(x) ** 2, axis=2), axis=0) for x in (H @ answer + V, answer)]
         return np.asarray(np.sqrt(np.concatenate(power)))
 
 
@@ -236,11 +228,10 @@ def begin_at(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) 
 
 def from_rest(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines, starts: Lines) -> Array:
     """Return the largest part of each signal from rest, the period begun at some samples, (n_starts, n_signals)."""
-    waves, n, n_u = limited.waves(c), limited.period, excited.e.shape[1]
+    waves, n = limited.waves(c), limited.period
     z, decay, parts = _steady(excited, limited, c, inputs), excited.decay(_PERIODS * n), []
     for start in starts:
         moved = np.tile(np.roll(waves, -start, axis=0), (_PERIODS, 1)) - decay @ z[start]
-        moved[0, -n_u:] = moved[0, -2 * n_u : -n_u] * excited.plant.rate_hz  # from 0
         parts.append(limited.part(moved).max(axis=0))
     return np.array(parts)
 
@@ -336,7 +327,7 @@ class Experiment(Judged):
     status : {"converged"}
     model : str
     criterion : str
-        "all", "worst" or the name of a parameter.
+        "all" or the name of a parameter.
     rate_hz : float
     period : int
         Samples of one period.

@@ -31,7 +31,6 @@ from ambid.simulation.rotor_bench import kind_of
 _ROUNDS = 2000  # of the multiplicative algorithm
 _MOST_TERMS = 2e9  # that it adds up, of many lines and parameters in fewer rounds
 _SETTLED = 1e-3  # of the equivalence theorem: largest slope over the mean
-_SHARP = 8.0  # power mean by which the worst of several is taken
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +87,6 @@ class Information:
     lines: Array  # (n_plants, n_lines, n, n), of one sample and unit squared amplitude
     prior: Array  # (n, n), what is known before
     weights: Array  # (n,), of the squared relative standard deviations in the criterion; their sum is 1
-    worst: bool = False  # whether the criterion is the largest of them instead of the mean
 
     @classmethod
     def of(
@@ -104,7 +102,7 @@ class Information:
             numbers, dict(first.theta), first.model.references(first.theta)
         )
         prior = np.array([sizes[k] / prior_sd[n] if n in prior_sd else 0.0 for k, n in enumerate(names)])
-        chosen = [n for n in numbers if reported(n)] if criterion in ("all", "worst") else [criterion]
+        chosen = [n for n in numbers if reported(n)] if criterion == "all" else [criterion]
         shapes = split_rows(first.model, first.theta, names) * sizes if isinstance(first.model, RotorModel) else None
         lines_of_plants = []
         for plant, noise, T in zip(plants, noises, driven, strict=True):
@@ -114,7 +112,7 @@ class Information:
         return cls(
             names=names, sizes=sizes, lines=np.array(lines_of_plants),
             prior=np.diag(prior**2) + (0.0 if shapes is None else shapes.T @ shapes),
-            weights=np.array([(n in chosen) / len(chosen) for n in names]), worst=criterion == "worst",
+            weights=np.array([(n in chosen) / len(chosen) for n in names]),
         )  # fmt: skip
 
     def among(self, keep: NDArray[np.int64]) -> Information:
@@ -135,15 +133,8 @@ class Information:
     def judge(self, M: Array) -> tuple[float, Array]:
         """Return the criterion at informations (n_plants, n, n), meaned over the plants, and its slopes by them."""
         V = np.linalg.inv(M)
-        each = np.diagonal(V, axis1=1, axis2=2) * self.weights
-        pull = np.broadcast_to(self.weights, each.shape)
-        value = each.sum(axis=1)
-        if self.worst:
-            top = each.max(axis=1, keepdims=True)
-            powers = (each / top) ** (_SHARP - 1.0)
-            mean = np.sum(powers * each / top, axis=1, keepdims=True) ** (1.0 / _SHARP)
-            pull, value = self.weights * powers * mean ** (1.0 - _SHARP), (mean * top)[:, 0]
-        return float(value.mean()), -(V * pull[:, None, :]) @ V / value.size
+        value = (np.diagonal(V, axis1=1, axis2=2) * self.weights).sum(axis=1)
+        return float(value.mean()), -(V * self.weights) @ V / value.size
 
 
 def power_design(information: Information, cost: Array, samples: float) -> tuple[Array, float]:

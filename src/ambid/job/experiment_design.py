@@ -17,7 +17,6 @@ from ambid.control.closed import Plant
 from ambid.control.curvature import advised, expected_shift, judge_shift
 from ambid.control.drawn import Spread, draw_plants, laws_of, magnet_check
 from ambid.control.experiment import (
-    SLEW,
     Design,
     ExcitedLoop,
     Expected,
@@ -96,7 +95,6 @@ class Wanted:
     criterion: str = "all"
     target: float = TARGET
     use: float = USE
-    slew: float | None = None  # V/s
     spread: float = SPREAD
     seed: int = 0
 
@@ -113,7 +111,6 @@ def design_experiment(
     criterion: str = "all",
     target: float = TARGET,
     use: float = USE,
-    slew: float | None = None,
     spread: float = SPREAD,
     rate_hz: float | None = None,
     closed: bool | None = None,
@@ -143,14 +140,12 @@ def design_experiment(
     lines : int, optional
         How many are excited, at most.
     criterion : str, optional
-        ``"all"``: mean over the parameters; ``"worst"``: the worst of them; or the name of one.
+        ``"all"``: mean over the parameters; or the name of one.
     target : float, optional
         Relative standard deviation for which the length of the record is told.
     use : float, optional
         Part of the way from rest to the limits of position and current that may be used; of a controller's rig to its
         trips. The bench is not linear, and what is estimated of a linear model moves with the amplitude.
-    slew : float, optional
-        Largest rate of change of the voltage, V/s.
     spread : float, optional
         Two relative standard deviations of free parameters of a rig, for the drawn plants; priors and estimates bring
         their own.
@@ -184,7 +179,6 @@ def design_experiment(
         {
             "seconds": seconds,
             "period": period,
-            "slew": slew,
             "rate_hz": rate_hz,
             "target": target or 0,
             "use": use or 0,
@@ -199,7 +193,7 @@ def design_experiment(
     check_switch({"closed": closed})
     wanted = Wanted(
         seconds=seconds, period_s=period, band=band, lines=lines, criterion=criterion, target=target, use=use,
-        slew=slew, spread=spread, seed=seed,
+        spread=spread, seed=seed,
     )  # fmt: skip
     say("read")
     known, bench = _given(source, rig, rate_hz, closed)
@@ -357,13 +351,9 @@ def _room(bench: AnyBench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Ar
     room, point = Room.of(bench.rig), {} if isinstance(bench, RotorBench) else bench.point._asdict()
     low, high = [], []
     for name in loop.signals:
-        if name.endswith(SLEW):
-            most = np.inf if wanted.slew is None else wanted.slew
-            ends, share = (-most, most), 1.0
-        else:
-            kind = kind_of(name)
-            trip = bench.rig.trip("current" if kind == "current" else "position")
-            ends, share = (room.voltage, VOLTAGE) if kind == "voltage" else (trip, wanted.use)
+        kind = kind_of(name)
+        trip = bench.rig.trip("current" if kind == "current" else "position")
+        ends, share = (room.voltage, VOLTAGE) if kind == "voltage" else (trip, wanted.use)
         rest = point.get(name, 0.0)
         low.append(share * (ends[0] - rest))
         high.append(share * (ends[1] - rest))
@@ -404,9 +394,9 @@ def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array
 def _refuse_criterion(criterion: str, names: tuple[str, ...]) -> None:
     """Refuse the name of what is not estimated."""
     names = tuple(n for n in names if reported(n) and not n.endswith(".delay"))
-    if criterion not in ("all", "worst", *names):
+    if criterion not in ("all", *names):
         raise AmbidError(
-            f"{setting('criterion')} {criterion!r}; it must be all, worst or an estimated parameter: "
+            f"{setting('criterion')} {criterion!r}; it must be all or an estimated parameter: "
             f"{', '.join(names)}."
             f"{nearest(criterion, list(names))} Correct it"
         )
@@ -584,7 +574,7 @@ def _signals(
     for k, (name, wave) in enumerate(waves.items()):
         finite = [float(x) if np.isfinite(x) else None for x in (low[k], high[k])]
         found[name] = SignalUse(
-            unit=f"{of.units[of.inputs[0]]}/s" if name.endswith(SLEW) else of.units[name],
+            unit=of.units[name],
             low=finite[0], high=finite[1], steady=float(used[0, 0, k]), from_rest=float(used[0, 1, k]),
             drawn=float(used[:, :, k].max()), peak=float(np.max(np.abs(wave))), reserve=float(spare[k]),
         )  # fmt: skip

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 _NONE = "–"
 
-_CRITERIA = {"all": "all parameters", "worst": "the worst parameter"}
-
 
 def experiment_document(experiment: Experiment, _: Any) -> Document:
     """Describe a designed experiment."""
@@ -67,7 +65,7 @@ def experiment_sections(experiment: Experiment) -> list[Section]:
 def title_of(experiment: Experiment) -> str:
     """Return what was designed, in a few words."""
     loop = "closed" if experiment.closed else "open"
-    aim = _CRITERIA.get(experiment.criterion, experiment.criterion)
+    aim = "all parameters" if experiment.criterion == "all" else experiment.criterion
     return f"experiment for {aim} of model {experiment.model}, {loop} loop"
 
 

@@ -91,12 +91,12 @@ _JOBS = (
     declare("ledger merge", "ledger other who why", ledger=_LEDGER),
     declare("ledger retain", "ledger older_than keep out who why", ledger=_LEDGER,
         out={"help": "Archive, a ledger that is made where there is none.", "kind": "text", "metavar": "FILE.db|URL"}),
-    declare("design experiment", "source out rig seconds period band criterion target use slew spread rate_hz closed "
+    declare("design experiment", "source out rig seconds period band criterion target use spread rate_hz closed "
         "seed json plot report strict force",
         out={"help": "Write one period of the excitation: .csv, .csv.gz or .h5.", "required": False},
         seconds={"shown": "10", "default": None},
         band={"shown": "one period to a fifth of the rate"},
-        criterion={"help": "all, worst, or the parameter that matters.", "default": "all", "metavar": "NAME"},
+        criterion={"help": "all, or the parameter that matters.", "default": "all", "metavar": "NAME"},
         rate_hz={"help": "Sampling rate in Hz.", "shown": "the bench's"},
         force={"help": "Overwrite an existing record."}),
     declare("design controller", "estimate rig out method goals limits spread form filters speeds_rpm "

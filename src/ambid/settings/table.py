@@ -152,7 +152,6 @@ SETTINGS = (
     Setting("set", "text", "NAME=VALUE", "Setting of the job, under its name in Python, such as from_s=0.5; "
         "repeatable.", many=True),
     Setting("settle", "from_zero", "S", "Time after the start that is not recorded, in s.", shown="1 when levitating"),
-    Setting("slew", "positive", "V/S", "Largest rate of change of the voltage.", shown="any"),
     Setting("source", "text", "RIG|PRESET|ESTIMATE", "Rig file, a bench that 'ambid models' lists, or what identify "
         "@json wrote.", argument=True, required=True),
     Setting("speed_rpm", "number", "RPM", "Speed of a rotor in rpm; once for each record, in their order.", many=True,
