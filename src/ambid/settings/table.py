@@ -39,8 +39,8 @@ SETTINGS = (
     Setting("delete", "switch", "", "Remove the journal once its record is written and nothing was damaged."),
     Setting("domain", "text", "", "Domain of the model: continuous or discrete time.", choices=("s", "z"),
         shown="z for @orders with a held input, else s"),
-    Setting("drift", "switch", "", "With @identify_nonlinear: let a force and a voltage drift beside the law, though it "
-        "may not pay."),
+    Setting("drift", "switch", "", "With @identify_nonlinear: let a force and a voltage drift beside the law, though "
+        "it may not pay."),
     Setting("duration", "positive", "S", "Length of each record, in s.", shown="as ambid simulate"),
     Setting("eddy", "switch", "", "With @identify_nonlinear: the force follows the current with a pole a/(s + a)."),
     Setting("estimate", "path", "E.json", "With @modes: compare them with the modes of a physical estimate (MAC)."),
