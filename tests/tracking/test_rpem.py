@@ -185,7 +185,7 @@ def test_a_joint_cause_of_one_number_alone_moves_nothing_together(monkeypatch):
 JOINT = np.array([1.0, 1.0, 0.0])
 
 
-def looks(slope, *, seed=1, from_=200, count=400, noise=1.0):
+def looks(slope, *, seed=1, from_=200, count=400, noise=1.0, alone=0):
     """Numbers that stand still until chunk `from_`, then drift by `slope` a chunk, known by a filter that expects no
     drift: after each chunk, where they are, where it takes them to be, how far that may be off, and their ends.
     """
@@ -202,9 +202,10 @@ def looks(slope, *, seed=1, from_=200, count=400, noise=1.0):
         )  # fmt: skip
         drift.add(evidence, known)
         known.absorb(evidence)
-        found.append((moved + 0.5 * slope, known.q.copy(), *drift.look(np.vstack([np.eye(p), JOINT]), 1.0)))
+        seen = drift.look(np.vstack([np.eye(p), JOINT]), alone, 1.0)
+        found.append((moved + 0.5 * slope, known.q.copy(), *seen))
     drift.restart()
-    assert drift.look(np.eye(p), 1.0).size == 0
+    assert drift.look(np.eye(p), alone, 1.0).size == 0
     return found
 
 
@@ -222,16 +223,18 @@ def test_what_a_drift_leaves_wrong_is_told_of_all_numbers():
     stands still beside it.
     """
     slope = 4e-2 * JOINT
-    for n in (5, 7, 10, 14, 20):
+    for n in (5, 10, 14, 20):
         now, taken, ways, ends, _ = looks(slope, count=201 + n, noise=0.0)[199 + n]
         right = np.argmin(np.abs(ends - now - slope).max(axis=1))
         np.testing.assert_allclose(ends[right], now + slope, atol=1e-4)
         np.testing.assert_allclose(ways[right], np.abs(now + slope - taken), rtol=0.02, atol=1e-6)
 
 
-def test_without_a_drift_little_is_suspected():
-    seen = [ways.size > 0 for seed in (1, 2, 3) for *_, ways, _, _ in looks(0.0 * JOINT, seed=seed)]
-    assert np.mean(seen) < 0.06
+@pytest.mark.parametrize(("alone", "share"), [(0, 0.06), (3, 0.28)])
+def test_without_a_drift_little_is_suspected(alone, share):
+    """Of one of three parameters alone two standard deviations count, over 0.5 and 1 s: 5 % each, which overlap."""
+    seen = [ways.size > 0 for seed in (1, 2, 3) for *_, ways, _, _ in looks(0.0 * JOINT, seed=seed, alone=alone)]
+    assert np.mean(seen) < share
 
 
 @pytest.mark.parametrize("known", [1.0, 1e4, 1e8])
@@ -249,7 +252,7 @@ def test_a_ramp_that_the_data_do_not_tell_at_all_is_none(known):
         )  # fmt: skip
         drift.add(evidence, before)
         before.absorb(evidence)
-        assert drift.look(np.eye(p), 1.0).size == 0
+        assert drift.look(np.eye(p), 0, 1.0).size == 0
 
 
 def test_a_look_is_one_between_chunks_and_the_same_without_adaptation():
@@ -260,14 +263,14 @@ def test_a_look_is_one_between_chunks_and_the_same_without_adaptation():
     )  # fmt: skip
     for ceiling in (10.0 * rates, rates):
         drift, known = DriftRates(rates, rates, ceiling, 0.025), ParameterFilter(np.zeros(p), np.eye(p))
-        first = drift.look(np.eye(p), 1.0)
+        first = drift.look(np.eye(p), 0, 1.0)
         for _ in range(13):
             drift.add(evidence, known)
         assert first.size == 0
-        assert drift.look(np.eye(p), 1.0) is (None if drift.adapts else first)
+        assert drift.look(np.eye(p), 0, 1.0) is (None if drift.adapts else first)
         drift.restart()
         drift.add(evidence, known)
-        assert drift.look(np.eye(p), 1.0) is first  # the window before is forgotten at once
+        assert drift.look(np.eye(p), 0, 1.0) is first  # the window before is forgotten at once
 
 
 def test_a_ramp_is_tested_as_in_the_dense_regression():

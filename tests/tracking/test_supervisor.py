@@ -96,6 +96,18 @@ def test_a_drift_that_begins_keeps_its_band_honest(name, seen_s):
     assert np.mean(np.abs(errors) < 4.0) > 0.99
 
 
+def test_a_load_that_comes_on_hides_no_drift_that_follows_it():
+    """The load jumps in the longer windows that ramps are looked for in, and explains these better than the drift."""
+    errors = []
+    for seed in (1, 2, 3):
+        bench = {"parameters": course("R", (1.8, 1.0), (2.8, 1.033)), "force": Schedule.step(0.0, 8.0, AT)}
+        run = tracked(simulated(**bench, seconds=2.8, seed=seed), seed=seed)
+        for line in run.lines:
+            true = {"R": TRUE["R"] * (1.0 + 0.033 * (line.t - 1.8))}
+            errors += [run.z(line, n, true.get(n, TRUE[n])) for n in line.parameters if line.t > 2.3]
+    assert np.max(np.abs(errors)) < 4.0
+
+
 def test_what_drifts_together_is_followed_together():
     """The magnet gains strength, of which k_x by itself shows little: half a second after, bands are honest."""
     powers, errors = ("k_i", "k_x", "L"), []

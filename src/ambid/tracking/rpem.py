@@ -110,12 +110,14 @@ _SLOWER, _FASTER = 0.5, 10.0  # factors by which one adaptation may change a var
 _ROUNDS = 10  # of raising a variance at one look
 _WITHIN = 6.0  # what may walk within a chunk, as squares of its innovations: more would be taken for other numbers
 _NOTICED = 3.0  # factor of a variance from which the recent past is filtered anew
-_RAMPS = np.array([5, 7, 10, 14, 20])  # chunks since which something may drift steadily
+_RAMPS = np.array([5, 10, 14, 20])  # chunks since which something may drift steadily
 # statistics from which it may be so: chance passes each as often, in 3e-4 of the cases for each chunk of the window
-_BEGUN = np.array([10.1, 9.5, 8.8, 8.2, 7.6])
+_BEGUN = np.array([10.1, 8.8, 8.2, 7.6])
+# of a parameter alone, two standard deviations where half a second may have passed: until more is shown it is far off
+_ALONE = np.array([10.1, 4.0, 4.0, 4.0])
 _ALIKE = 9.2  # by which statistics of drifts differ by chance in one of a hundred cases
 _ROUNDED = 1e-9  # of a ramp's information: what is left of it beside the other numbers is not known better
-_BETWEEN = 0.02  # of a statistic, that is lost where a drift began in the middle between two windows
+_BETWEEN = 0.07  # of a statistic, that is lost where a drift began in the middle between two windows
 
 
 class DriftRates:
@@ -194,11 +196,11 @@ class DriftRates:
             if np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0):
                 present.set(np.where(active, q, present.q), P)
 
-    def look(self, toward: Array, noise: float) -> Array | None:
-        """Look, where a chunk is complete, else None, for ramps of the causes `toward` (n_causes, p) in windows up to
-        now; return those that chance does not make, and that explain the data about as well as the likeliest: by how
-        much the numbers are off, where they are, with what variance, (3, n, p), as of `ramps`; `noise`: the residual's
-        variance.
+    def look(self, toward: Array, alone: int, noise: float) -> Array | None:
+        """Look, where a chunk is complete, else None, for ramps of the causes `toward` (n_causes, p), the first of them
+        `alone` parameters, in windows up to now; return those that show, and that explain their window about as well
+        as the likeliest: by how much the numbers are off, where they are, with what variance, (3, n, p), as of
+        `ramps`; `noise`: the residual's variance.
         """
         windows = int(np.searchsorted(_RAMPS, self._count, side="right"))
         if not (windows and self.adapts):
@@ -209,7 +211,9 @@ class DriftRates:
             T, ends = self.ramps(_RAMPS[:windows], toward, noise)
         except np.linalg.LinAlgError:  # numbers of which so little was known that the data's information is lost
             return self._none
-        likely = np.maximum(_BEGUN[:windows, None], (1.0 - _BETWEEN) * T.max() - _ALIKE) < T
+        best = T.max(axis=1, keepdims=True)  # a window that holds a jump says nothing of those that do not
+        least = np.where(np.arange(len(toward)) < alone, _ALONE[:windows, None], _BEGUN[:windows, None])
+        likely = np.maximum(least, (1.0 - _BETWEEN) * best - _ALIKE) < T
         return np.asarray(ends[:, likely])
 
     def ramps(self, lengths: NDArray[np.int64], toward: Array, noise: float) -> tuple[Array, Array]:
@@ -374,7 +378,7 @@ class PhysicalRpem:
 
     def begun(self) -> Array | None:
         """Return drifts that may have begun, as of `DriftRates.look`."""
-        return self.drift.look(self._causes, self.noise)
+        return self.drift.look(self._causes, len(self.names), self.noise)
 
     def predict(self) -> None:
         """Let the numbers walk over one block; what a joint cause moves together, where two of them have begun to."""

@@ -81,10 +81,10 @@ class Supervisor:
         source = (self.publication.accepted, self._fresh, self._trusted(), self._begun)
         if self._shown is None or any(a is not b for a, b in zip(self._shown, source, strict=True)):
             accepted, fresh, trusted, (ways, ends, spread) = self._shown = source
-            # where a drift is not followed yet: the rest of it, as if it were chance, beside what is known under it
+            # where a drift is not followed yet, three standard deviations hold the far end of where it may be
             variance = accepted.covariance.diagonal()
-            held = np.maximum(variance, spread) + np.minimum(np.abs(ends - accepted.values), ways) ** 2
-            more = np.diag((held - variance).max(axis=0, initial=0.0))
+            far = np.minimum(np.abs(ends - accepted.values), ways) + 2.0 * np.sqrt(spread)
+            more = np.diag(((far / 3.0) ** 2 - variance).max(axis=0, initial=0.0))
             accepted = replace(accepted, covariance=accepted.covariance + more)
             now = {name: one and trusted for name, one in fresh.items()}
             self._parameters = published(self.rpem.numbers, accepted, "parameter", now)
