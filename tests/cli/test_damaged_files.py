@@ -25,7 +25,7 @@ WHOLE = {
     "73.mat": lambda path: v73(path, log=[series("u", U, TIME), series("x", 1.0 * X, TIME)]),
     "r.h5": lambda path: write_record(RECORD, path),
     "r.csv.gz": lambda path: write_record(RECORD, path),
-    "r.uff": lambda path: path.write_bytes(uff([(4, 1, 7, F, plant()[:, 0], ("m", "V"))], binary=True)),
+    "r.uff": lambda path: path.write_bytes(uff([(4, 1, 7, F, plant()[:, 0], ("m", "V"))])),
 }
 RECORD = Record(rate_hz=1e3, channels=(Channel(name="u", unit="V", values=U, source_unit="V"),))
 DAMAGE = {
