@@ -56,11 +56,20 @@ def test_an_offset_moves_the_operating_point_alone(record):
     assert estimate["L"].sd_calibrated == ambid.identify(record, rig_of(SD))["L"].sd_calibrated
 
 
-def test_what_is_hardly_moved_is_left_out(record):
-    """A weighed mass: a gain moves the others by parts of a per cent."""
+def test_what_is_hardly_moved_is_left_out_and_a_weighed_mass_is_a_scale_itself(record):
+    """A weighed mass: a gain moves the others by parts of a per cent, and so does the mass, which is told beside it."""
     rig = rig_of({}, m={"role": "fixed", "value": 0.1})
-    (line,) = calibration_lines(ambid.identify(record, rig))
-    assert " m" not in line.partition("moves: ")[2]
+    estimate = ambid.identify(record, rig)
+    (line,) = calibration_lines(estimate)
+    gains, _, mass = line.partition("moves: ")[2].partition("; m (fixed) ")
+    assert " m" not in gains
+    assert mass.startswith("k_x +1 %, k_i")
+    heavier = ambid.identify(record, rig_of({}, m={"role": "fixed", "value": 0.1001}))
+    for name in ("k_x", "k_i"):
+        moved = heavier[name].value / estimate[name].value - 1.0
+        assert estimate.calibration["m"][name] == pytest.approx(
+            moved / 1e-3, abs=0.15
+        )  # of the spectrum of the voltage alone
     assert "+0 %" not in line
 
 

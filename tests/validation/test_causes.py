@@ -13,6 +13,7 @@ from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig, rig_of_preset
 from ambid.validation.causes import Cause, causes, causes_check, named_bias
+from ambid.validation.physical import by_bands
 from tests.tiers import runs
 
 
@@ -30,7 +31,7 @@ def columns_of(name, seed, duration=1.0):
 
 def strongest(columns, rate_hz):
     fit, means = fitted(columns, rate_hz)
-    return [c for c in causes(fit, means, thorough=True) if c.p < 1e-4]
+    return [c for c in causes(fit, means, default_rig(), thorough=True) if c.p < 1e-4]
 
 
 def test_sound_records_name_no_cause():
@@ -47,7 +48,7 @@ def test_probabilities_are_those_of_chance_on_sound_records():
     for seed in range(1, 1 + runs(60, short=8)):
         for name in ("thesis", "unstable-bearing", "prototype"):
             fit, means = fitted(*columns_of(name, seed, 0.5))
-            chances += [c.p for c in causes(fit, means, thorough=False)]
+            chances += [c.p for c in causes(fit, means, default_rig(), thorough=False)]
     p = np.array(chances)
     n = p.size
     for level in (0.01, 0.1, 0.5):
@@ -91,10 +92,10 @@ def test_a_delay_that_is_given_wrong_is_named():
     bench = load_bench(columns, default_rig(), rate_hz=rate_hz, units={"voltage": "V", "current": "A", "position": "m"})
     rig = default_rig()
     fit = greybox(rig.plant, signals_of(bench, rig.plant), rig.parameters, delay=0.0)
-    first = causes(fit, {}, thorough=True, delay_given=True)[0]
+    first = causes(fit, {}, default_rig(), thorough=True, delay_given=True)[0]
     assert first.name == "input_delay"
     assert first.size > 0.25 / rate_hz
-    assert "input_delay" not in [c.name for c in causes(fit, {}, thorough=True)]
+    assert "input_delay" not in [c.name for c in causes(fit, {}, default_rig(), thorough=True)]
 
 
 def test_size_and_shift_are_what_a_drift_of_the_resistance_did():
@@ -105,7 +106,7 @@ def test_size_and_shift_are_what_a_drift_of_the_resistance_did():
     columns["current"] = i
     columns["voltage"] += 1.6 * 2.0 + 0.02 * np.linspace(-1.0, 1.0, i.size) * i
     spoiled, means = fitted(columns, rate_hz)
-    drift_found = next(c for c in causes(spoiled, means, thorough=False) if c.name == "r_drift")
+    drift_found = next(c for c in causes(spoiled, means, default_rig(), thorough=False) if c.name == "r_drift")
     assert drift_found.size == pytest.approx(0.02, rel=0.1)
     n, size = spoiled.problem.n_physical, spoiled.problem.magnitude
     moved = (spoiled.problem.parameters(spoiled.vector), clean.problem.parameters(clean.vector))
@@ -119,7 +120,7 @@ def test_intervals_hold_what_a_named_cause_did():
     columns, rate_hz = columns_of("unstable-bearing", 1)
     columns["position"] += 0.01 * columns["position"].std() / columns["current"].std() * columns["current"]
     spoiled, means = fitted(columns, rate_hz)
-    found = causes(spoiled, means, thorough=True)
+    found = causes(spoiled, means, default_rig(), thorough=True)
     bias = named_bias(found, np.zeros(spoiled.problem.n_physical))
     assert np.any(np.abs(bias) > 0.0)
     units = {"voltage": "V", "current": "A", "position": "m"}
@@ -199,6 +200,80 @@ def test_a_fixed_value_that_is_wrong_is_the_cause_and_what_it_moved_is_held():
     assert not estimate.checks["fixed_agree"].passed
     for name in free:
         assert abs(estimate[name].value - truth[name]) < 4.0 * estimate[name].sd
+
+
+def weighed(value, **channels):
+    free = {name: {"unit": unit} for name, unit in (("k_x", "N/m"), ("k_i", "N/A"), ("R", "ohm"), ("L", "H"))}
+    mass = {"m": {"value": value, "unit": "kg", "role": "fixed"}}
+    return {"schema": "ambid.rig/1", "name": "weighed", "model": "one-axis", "parameters": mass | free, **channels}
+
+
+@pytest.mark.parametrize("wrong", ["voltage", "current", "position", "rate"])
+def test_a_scale_that_a_weighed_mass_contradicts_is_named_beside_it_and_held(wrong):
+    """The record shows a contradiction alone: the mass, a gain or the rate is wrong, and each moves other numbers."""
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    truth = {p.name: p.value for p in rig_of_preset(preset("unstable-bearing")).parameters}
+    if wrong == "rate":
+        rate_hz *= 1.03
+    else:
+        columns[wrong] = 1.03 * columns[wrong]
+    estimate = ambid.identify(columns, weighed(truth["m"]), rate_hz=rate_hz, units=UNITS)
+    reason = next(r for r in estimate.verdict.reasons if r.check == "causes")
+    assert (reason.cause, *reason.alternatives[:2]) == ("fixed_value", "sensor_gain", "rate")
+    for name in ("k_x", "k_i", "R", "L"):
+        assert abs(estimate[name].value - truth[name]) < 2.0 * estimate[name].sd
+
+
+def test_a_scale_that_the_rig_knows_is_not_blamed():
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    mass = 1.05 * next(p.value for p in rig_of_preset(preset("unstable-bearing")).parameters if p.name == "m")
+    channels = {c: {"column": c, "gain_sd": 1e-3} for c in ("voltage", "current", "position")}
+    known = ambid.identify(
+        columns, weighed(mass, channels=channels, record={"rate_sd": 1e-4}), rate_hz=rate_hz, units=UNITS
+    )
+    guessed = ambid.identify(columns, weighed(mass), rate_hz=rate_hz, units=UNITS)
+    reason = next(r for r in known.verdict.reasons if r.check == "causes")
+    assert reason.cause == "fixed_value"
+    assert not {"sensor_gain", "rate"} & set(reason.alternatives)
+    assert known["R"].sd < 0.5 * guessed["R"].sd
+
+
+def test_bands_of_a_sound_record_agree():
+    """Beyond 4 standard deviations by chance nearly never, of what is not fed back."""
+    for seed in range(1, 1 + runs(20, short=3)):
+        fit, _ = fitted(*columns_of("thesis", seed))
+        assert not np.any(by_bands(fit))
+
+
+def test_intervals_hold_what_a_band_of_disturbance_moved():
+    """A motion beside that of the record, with its voltage, is that of a force that is not white: stiffness and mass
+    are drawn to what that force would need, and the rest of the record does not agree.
+    """
+    plain = rig_of_preset(preset("unstable-bearing"))
+    truth = {p.name: p.value for p in plain.parameters}
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    clean = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+    rng, n = np.random.default_rng(1), columns["position"].size
+    f = np.fft.rfftfreq(n, 1.0 / rate_hz)
+    motion = np.fft.irfft(((f > 50.0) & (f < 150.0)) * np.exp(2j * np.pi * rng.random(f.size)), n)
+    motion *= 0.15 * columns["position"].std() / motion.std()
+    columns["position"] = columns["position"] + motion
+    columns["voltage"] = columns["voltage"] + truth["k_i"] * (np.roll(motion, -1) - motion) * rate_hz
+    fit, _ = fitted(columns, rate_hz)
+    estimate = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+    assert estimate.verdict.word != "usable"
+    assert max(abs(estimate[name].value - truth[name]) / clean[name].sd for name in ("m", "k_x")) > 8.0
+    assert np.any(by_bands(fit))
+    for name in ("m", "k_x", "k_i", "R", "L"):
+        assert abs(estimate[name].value - truth[name]) < 3.0 * estimate[name].sd
+
+
+def test_no_number_is_identified_where_the_verdict_is_not_to_use_it():
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    columns["position"] = 1e6 * columns["position"]  # in micrometres, and said to be in metres
+    estimate = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+    assert estimate.verdict.word == "unusable"
+    assert not any(p.identifiable for p in estimate.parameters if p.role != "fixed")
 
 
 def test_a_force_whose_frequency_changes_is_named_by_its_band_and_taken_in():

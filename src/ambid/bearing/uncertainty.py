@@ -7,7 +7,7 @@ where the model is only near the truth (the sandwich of White 1982, by batches).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -72,7 +72,8 @@ class Uncertainty:
     # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
     disagreement: Array
     bias: Array  # (n,), SI, what causes that the tests name have done to the estimate; part of all intervals
-    # (n_facts, n), SI, how far the estimate moves to what facts without a fit say that contradict it; part of them too
+    # (n_moves, n), SI, how far the estimate moves without bands that disagree, and to what facts without a fit say that
+    # contradict it; part of them too
     apart: Array
 
     @property
@@ -202,6 +203,12 @@ def _upper_level(fit: Fit, j: int, work: Workspace) -> Array:
     upper = fit.vector.copy()
     upper[place] += inside
     return upper
+
+
+def farthest(moves: Sequence[Array]) -> Array:
+    """Return by how far each number (n,) is moved by that of several `moves`, (n,) each, which moves it farthest."""
+    stacked = np.array(moves)
+    return np.asarray(np.take_along_axis(stacked, np.argmax(np.abs(stacked), axis=0)[None], axis=0)[0])
 
 
 def _gram(a: Array) -> Array:

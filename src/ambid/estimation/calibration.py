@@ -31,6 +31,7 @@ from ambid.rig.rig import Rig
 
 _BANDS, _EDGES = 200, 0.05  # of the spectrum of a record's inputs; part of the record in which it fades in, and out
 _DUST = 1e-9
+_UNIT, _RULED_OUT = 0.5, 4.0  # error from which a unit is wrong, not a scale; in sds of the rig, from which it is none
 
 
 E = TypeVar("E", bound=Parametric)
@@ -58,12 +59,9 @@ def calibrated(
     made, sources, references = cast("Any", estimate), _sources(rig, plant, theta), plant.references(theta)
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
     try:
-        moved = error_moves(plant, theta, errors, free=names, lines=lines)
+        moved = _moved(rig, plant, theta, names, errors, covariance, lines)
     except np.linalg.LinAlgError:  # an estimate far from a plant, such as one that did not converge
         return estimate
-    moved *= np.array([theta[name] or references.get(name, 1.0) for name in names])[:, None]
-    weights = {p.name: p.sd**-2 for p in rig.parameters if p.role == "prior" and p.sd}
-    moved -= covariance @ (np.array([weights.get(name, 0.0) for name in names])[:, None] * moved)
     if weight is not None:
         gain, slope = weight
         by_weight = np.array([-float(e == SensorError(kind="gain", channel="current")) for e in errors])
@@ -85,8 +83,46 @@ def calibrated(
     )
 
 
+def explaining(
+    rig: Rig, plant: LinearModel, theta: Mapping[str, float], names: Sequence[str], covariance: Array,
+    lines: Sequence[Lines], slope: Array, far: float, *, own: Mapping[str, float] | None = None,
+) -> dict[str, tuple[float, Array]]:  # fmt: skip
+    """Return the errors of gains or of the rate that explain alone why slopeᵀ θ is too large by `far`, relative, and
+    what they have moved `names` by, SI; none that the rig rules out, or that is large enough for a wrong unit.
+
+    `covariance` (n, n): of the first of `names`, on which there may be priors; `own`: what an error of one does to what
+    slopeᵀ θ is compared with, by channel.
+    """
+    out = dict[str, tuple[float, Array]]()
+    sources = {name: s for name, s in _sources(rig, plant, theta).items() if s.errors[0].kind == "gain"}
+    try:
+        moved = _moved(rig, plant, theta, names, [s.errors[0] for s in sources.values()], covariance, lines)
+    except np.linalg.LinAlgError:
+        return out
+    for (name, s), column in zip(sources.items(), moved.T, strict=True):
+        whole = s.whole * column
+        along = float(slope @ whole) - (own or {}).get(name, 0.0)
+        size = far / along if abs(along) > _DUST else np.inf
+        if abs(size) < min(_UNIT, np.inf if s.sd is None else _RULED_OUT * s.sd):
+            out[name] = size, size * whole
+    return out
+
+
+def _moved(
+    rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str],
+    errors: Sequence[SensorError], covariance: Array, lines: Sequence[Lines],
+) -> Array:  # fmt: skip
+    """Return d theta/d e, (n_names, n_errors), SI."""
+    references, n = plant.references(theta), len(covariance)
+    moved = error_moves(plant, theta, errors, free=names, lines=lines)
+    moved *= np.array([theta[name] or references.get(name, 1.0) for name in names])[:, None]
+    weights = {p.name: p.sd**-2 for p in rig.parameters if p.role == "prior" and p.sd}
+    moved[:n] -= covariance @ (np.array([weights.get(name, 0.0) for name in names[:n]])[:, None] * moved[:n])
+    return moved
+
+
 def _sources(rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float]) -> dict[str, _Source]:
-    """Return what may be wrong of a bench: gains of inputs and outputs, the rate, planes that are fixed."""
+    """Return what may be wrong of a bench: gains of inputs and outputs, the rate, values and planes that are fixed."""
     sources = {
         c.role: _Source(errors=[SensorError(kind="gain", channel=c.role)], sd=c.gain_sd)
         for c in rig.channels
@@ -95,7 +131,11 @@ def _sources(rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, floa
     # a rate that is too high makes times too short
     sources["rate"] = _Source(errors=[SensorError(kind="gain", channel="time")], sd=rig.record.rate_sd, whole=-1.0)
     if not isinstance(plant, RotorModel):
-        return sources
+        return sources | {
+            p.name: _Source(errors=[SensorError(kind="fixed", channel=p.name)], sd=None, whole=theta[p.name])
+            for p in rig.parameters
+            if p.role == "fixed" and p.value
+        }
     fixed, span = {p.name for p in rig.parameters if p.role == "fixed"}, plant.span(theta)
     for b in (b for b in plant.bearings if not b.axial):
         read = [b.sensor_parameter(k) for k in range(len(b.z_sensors))]

@@ -515,7 +515,8 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     sensitivity : Mapping[str, Any]
         Peak of the sensitivity of axis ``x``, where a loop is known or a reference is logged.
     calibration : Mapping[str, Mapping[str, float]]
-        By channel, and ``"rate"``, the per cent by which an error of 1 % would move each estimated parameter.
+        By channel, ``"rate"`` and fixed value, the per cent by which an error of 1 % would move each estimated
+        parameter.
     calibration_sd : Mapping[str, float]
         What the rig says of these errors: relative standard deviations of gains and rate, SI ones of offsets
         (``"current.offset"``), which move the operating point alone.

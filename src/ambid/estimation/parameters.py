@@ -28,7 +28,8 @@ class EstimatedParameter(NDArrayOperatorsMixin):
     sd: float
     ci95: tuple[float, float]  # 95 % interval, value -+ 1.96 sd
     role: Literal["free", "fixed", "prior"]
-    # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
+    # whether the data (with the priors) show it: relative sd under 25 %, and the verdict is not "do not use". True for
+    # a fixed parameter.
     identifiable: bool
     data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
     sd_calibrated: float | None = None  # with what the rig says of calibration; None where it says nothing

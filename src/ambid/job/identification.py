@@ -226,6 +226,9 @@ def identify_axis(
     say("check")
     with one_thread():
         estimate = _grown(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
+        if estimate.verdict.word == "unusable":  # its own checks disown every number
+            disowned = tuple(replace(p, identifiable=p.role == "fixed") for p in estimate.parameters)
+            estimate = replace(estimate, parameters=disowned)
         if "reference" in bench or (rig.loop is not None and not rig.open_loop):
             from ambid.job.closed_loop import loop_and_peaks
 
@@ -307,7 +310,8 @@ def _judged(
     spread, moved = uncertainty(fit, products.scores), physical.agreement(fit)
     checks = physical.innovation_checks(fit, products, spread, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
-    spread = replace(spread, disagreement=moved.disagreement() if robust else np.zeros(len(spread.names)))
+    if robust:
+        spread = replace(spread, disagreement=moved.disagreement(), apart=physical.by_bands(fit))
     freed = {name: free_one(fit, name) for name in problem.known}
     checks |= physical.assumption_checks(fit, spread, freed, delay_how)
     signals = signals_of(bench, problem.model)
@@ -332,7 +336,7 @@ def _judged(
         for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
             named = [
                 c
-                for c in causes(fit, means, thorough=thorough, delay_given=given, freed=freed)
+                for c in causes(fit, means, rig, thorough=thorough, delay_given=given, freed=freed)
                 if not bent or c.name != "curvature"
             ]
             judged = causes_check(named, {**before, "in_time": in_time}, own, robust=robust, record=bench)

@@ -216,6 +216,7 @@ _FELT, _LINEAR = 0.05, 100.0  # per cent: less is not shown, and more is of a nu
 def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
     """Say what 1 % of each scale would move that the rig says nothing of; channels of one kind together."""
     e, stated = estimate, estimate.calibration_sd
+    fixed = [name for name in e.calibration if any(p.name == name for p in e.parameters)]
     kinds, worst = dict[str, dict[str, float]](), dict[str, tuple[float, str]]()  # channels of a kind; by bearing
     for source, moves in e.calibration.items():
         bearing, dot, _ = source.partition(".")
@@ -225,7 +226,8 @@ def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
             name, x = max(_shown(moves).items(), key=lambda item: abs(item[1]), default=("", 0.0))
             worst[bearing] = max(worst.get(bearing, (0.0, "")), (abs(x), f"{source} {name} {_per_cent(x)}"))
             continue
-        kind = kinds.setdefault(source.rpartition("_")[2].rstrip("0123456789"), dict.fromkeys(moves, 0.0))
+        own = f"{source} (fixed)" if source in fixed else source.rpartition("_")[2].rstrip("0123456789")
+        kind = kinds.setdefault(own, dict.fromkeys(moves, 0.0))
         for name, x in moves.items():
             kind[name] += x
     words = [f"{kind} {moved}" for kind, moves in kinds.items() if (moved := _grouped(_shown(moves)))]
@@ -237,6 +239,7 @@ def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
             p.name == "m" for p in e.parameters
         )
         weigh = ", or weigh one thing: with m fixed, a wrong factor or clock shows" if unweighed else ""
+        weigh += f", and a prior with its sd for {names_words(fixed)}" if fixed else ""
         lines.append(f"{first}1 % of gain moves: {'; '.join(words)}. Give gain_sd and rate_sd in the rig{weigh}")
     if planes:
         span = e.plant.span(e.numbers)  # type: ignore[union-attr]  # only rotors have planes

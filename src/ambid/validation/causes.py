@@ -20,6 +20,8 @@ from itertools import pairwise
 import numpy as np
 
 from ambid.arrays import Array, Complex
+from ambid.bearing.uncertainty import farthest
+from ambid.estimation.calibration import explaining, lines_of
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import (
@@ -36,6 +38,7 @@ from ambid.estimation.linear import column_sizes, directions, periods_near, wave
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
+from ambid.rig import Rig
 from ambid.validation.cause_signals import MANY, WAVES, Column, Course, groups_of, half_waves
 from ambid.validation.facts import between_samples
 
@@ -60,6 +63,8 @@ _GROWING = {
     "friction", "amplifier_lag",
 }  # fmt: skip
 """Causes whose signals are known but for their sizes."""
+_KNOWN = {"fixed_value", "sensor_gain", "rate"}
+"""Causes in what the rig says."""
 _OPPOSING = {"dead_time", "friction"}
 """Causes that physics gives a sign."""
 _GOES_ON = 0.01  # probability by chance, of faster waves, below which a walk goes on beyond those that were taken
@@ -109,8 +114,9 @@ def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
 
 
 def causes(
-    fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given: bool = False, freed: Freed | None = None
-) -> list[Cause]:
+    fit: Fit, means: Mapping[str, float], rig: Rig, *, thorough: bool, delay_given: bool = False,
+    freed: Freed | None = None,
+) -> list[Cause]:  # fmt: skip
     """Return the causes that the innovations of model one-axis may have, the strongest first.
 
     `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed;
@@ -139,8 +145,7 @@ def causes(
         line = found.pop()
         at, p = lines[0].k * rate_hz / course.t.size, min(line.p, lines[0].p)
         found.append(replace(line, channel=lines[0].channel, size=at, p=p))
-    known = fit.problem.known
-    found += _fixed({name: free_one(fit, name) for name in known} if freed is None else freed, known)
+    found += _fixed(fit, rig, {name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed)
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
@@ -149,16 +154,31 @@ def causes(
     ]
 
 
-def _fixed(freed: Freed, known: Mapping[str, float]) -> Iterator[Cause]:
-    """Yield each fixed value as a cause: what freeing it would gain, and move."""
+def _fixed(fit: Fit, rig: Rig, freed: Freed) -> Iterator[Cause]:
+    """Yield each fixed value as a cause: what freeing it would gain, and move; and, where that is seen, each gain and
+    the rate: an error that puts the fixed value as far from the data explains them as well, and moves the others too.
+    """
+    problem, theta = fit.problem, fit.problem.parameters(fit.vector)
+    n, unit = problem.n_physical, np.outer(problem.magnitude, problem.magnitude)
     for name, (gain, step) in freed.items():
-        if gain > 0.0:
-            shift = step[:-1] * np.sqrt(max(1.0 - 1.0 / gain, 0.0))
-            p, size = chi_squared_tail(1, gain), step[-1:]
+        if not gain > 0.0:
+            continue
+        p, sure = chi_squared_tail(1, gain), np.sqrt(max(1.0 - 1.0 / gain, 0.0))
+        far = abs(float(step[-1])) > abs(theta[name]) > 0.0
+        moves = {("fixed_value", name): (float(step[-1]), step[:-1])}
+        if p < _CHANCE and theta[name]:
+            covariance = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n] * unit
+            slope, names = np.append(np.zeros(n), 1.0 / theta[name]), (*problem.estimated, name)
+            scales = explaining(
+                rig, problem.model, theta, names, covariance, [lines_of(fit)], slope, float(slope @ step)
+            )
+            kinds = {"rate": "rate"}
+            moves |= {(kinds.get(k, "sensor_gain"), k): (e, (step - moved)[:-1]) for k, (e, moved) in scales.items()}
+        for (cause, channel), (size, shift) in moves.items():
+            sizes = np.array([size])
             yield Cause(
-                name="fixed_value", channel=name, gain=gain, p=p, size=float(size[0]), shift=shift, sizes=size,
-                far=abs(float(size[0])) > abs(known[name]) > 0.0,
-            )  # fmt: skip
+                name=cause, channel=channel, gain=gain, p=p, size=size, shift=shift * sure, sizes=sizes, far=far
+            )
 
 
 def _net(cause: Cause) -> float:
@@ -189,7 +209,7 @@ def extended(
     predictor. Sizes and parameters are found in turn, and the information of the parameters is what is left beside the
     sizes.
     """
-    sure = [c for c in found if c.p < _CHANCE and c.name != "fixed_value"]
+    sure = [c for c in found if c.p < _CHANCE and c.name not in _KNOWN]
     if not sure or fit.problem.n_used > _LONGEST:
         return None
     cause = sure[0]
@@ -524,8 +544,8 @@ _TEXT = {
     "slow_current": "the current's sensor drifts. Measure its zero before and after, or record shorter",
     "amplifier_lag": "the coil's voltage follows the logged one late, as through a filter: an amplifier of small "
     "bandwidth. Log the coil's voltage, or excite more slowly",
-    "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a scale or the rate is. Check "
-    "it, or free it",
+    "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a gain or the rate is. Check it, "
+    "or free it",
     "sampling": "the voltage changes between samples, so that its log does not say what the coil got. Log every sample "
     "of the controller",
     "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",
@@ -541,8 +561,7 @@ _TEXT = {
 def named_bias(found: Sequence[Cause], known: Array) -> Array:
     """Return the largest shift of each parameter by the strongest cause and those about as strong, or as is `known`."""
     sure = [c for c in found if c.p < _CHANCE]
-    stacked = np.array([known, *(c.shift for c in sure if c.gain > _ALIKE * sure[0].gain)])
-    return np.asarray(np.take_along_axis(stacked, np.argmax(np.abs(stacked), axis=0)[None], axis=0)[0])
+    return farthest([known, *(c.shift for c in sure if c.gain > _ALIKE * sure[0].gain)])
 
 
 def causes_check(

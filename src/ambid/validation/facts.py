@@ -19,7 +19,8 @@ from statistics import NormalDist
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.uncertainty import Uncertainty
+from ambid.bearing.uncertainty import Uncertainty, farthest
+from ambid.estimation.calibration import explaining, lines_of
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, evaluate, workspace_near
 from ambid.estimation.uncertainty import chi_squared_tail, natural_sizes
@@ -307,11 +308,17 @@ def informed(
         moves.append((facts["ohm"].size or 0.0) * np.eye(n)[names.index("R")])
     if weight is not None and not weight.passed and "k_i" in names:
         j, far = names.index("k_i"), weight.values["expected"] - weight.values["k_i_over_m"]
-        moves.append(far * theta["m"] * covariance[j] / covariance[j, j])
+        slope = np.array([(name == "k_i") / theta["k_i"] - (name == "m") / theta["m"] for name in names])
+        scales = explaining(
+            rig, fit.problem.model, theta, names, spread.information, [lines_of(fit)], slope,
+            1.0 - weight.values["expected"] / weight.values["k_i_over_m"], own={"current": -1.0},
+        )  # fmt: skip
+        own = far * theta["m"] * covariance[j] / covariance[j, j]
+        moves.append(farthest([own, *(-moved for _, moved in scales.values())]))
     named = facts.get("causes")
     if named is not None and not named.passed and "sampling" in (named.cause, *named.alternatives):
         moves += [theta[name] * np.eye(n)[names.index(name)] for name in ("R", "L") if name in names]
-    spread = replace(spread, apart=np.array(moves).reshape(-1, n))
+    spread = replace(spread, apart=np.vstack([spread.apart, *moves]))
     single = rig.magnet is not None and rig.magnet.kind == "single"
     if weight is None or not (weight.passed and single) or "k_i" not in names:
         return fit, spread, None

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -28,12 +29,14 @@ from ambid.estimation.likelihood import (
     Products,
     extend,
     products,
+    residual_blocks,
     search,
     sparse_gain,
     weight_of,
     workspace_near,
 )
 from ambid.estimation.linear import column_sizes, directions
+from ambid.estimation.predictor import busiest
 from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
@@ -57,6 +60,8 @@ _BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither recor
 _SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
 _STRIDES = (2, 4)
 _MOST = 4.0  # shift in its standard deviations that chance allows
+_LONGEST = 100_000  # samples of which bands are left out, the busiest
+_KNOWN = 0.25  # of a variance: the difference to one that is nearly equal is not known better
 _BEYOND = 10.0  # from which no number is to be used
 _LOST = 100.0  # standard deviation over value from which its size says nothing
 _FAR = 3.3  # standard deviations between a prior and the record
@@ -221,8 +226,7 @@ def agreement(fit: Fit) -> Agreement:
             continue
         spread = directions(np.vstack([again.J, again.J_prior])).inverse()[:n, :n]
         shifts.append((again.vector[:n] - fit.vector[:n]) * size)
-        # at least a quarter of its variance: the difference of two nearly equal variances is not known better
-        spreads.append(np.sqrt(np.maximum(np.diag(spread - own), 0.25 * np.diag(spread))) * size)
+        spreads.append(np.sqrt(np.maximum(np.diag(spread - own), _KNOWN * np.diag(spread))) * size)
         strides.append(stride)
     return Agreement(
         names=problem.estimated,
@@ -230,6 +234,39 @@ def agreement(fit: Fit) -> Agreement:
         sd=np.array(spreads).reshape(-1, n),
         strides=tuple(strides),
     )
+
+
+def by_bands(fit: Fit) -> Array:
+    """Return how far parameters move where two octaves of the record are left out, (n_bands, n), SI, as far as it is
+    beyond chance, else 0. One Newton step, with the levels of noise as they are: what disturbs a band has moved the
+    estimate, and the rest of the record does not agree.
+
+    For intervals of a model that does not fit: where noise is fed back, slopes hold some of it, and bands move the
+    numbers a little also if the model is right.
+    """
+    problem, n, kept = fit.problem, fit.problem.n_physical, np.ones(fit.problem.size + 1, dtype=bool)
+    kept[problem.slices["noise"]] = False
+    at = busiest(problem.u[problem.skip :], min(_LONGEST, problem.n_used))
+    blocks = residual_blocks(problem, fit.vector, weight_of(fit.covariance), workspace_near(fit, problem))
+    rows = np.concatenate([block[:, :, kept] for block in blocks])[at]
+    lines = np.fft.rfft(rows, axis=0) * np.sqrt(2.0 / len(rows))
+    lines[0] /= np.sqrt(2.0)
+    octaves = np.split(lines, 2 ** np.arange(1, int(np.log2(len(lines)))))
+    sums = [(f.conj().T @ f).real for f in (octave.reshape(-1, octave.shape[-1]) for octave in octaves)]
+    prior = np.column_stack([fit.J_prior, fit.r_prior])[:, kept]
+    whole = np.sum(sums, axis=0) + prior.T @ prior
+    scale = np.outer(*(column_sizes(np.sqrt(np.diag(whole)[:-1])[None, :]),) * 2)
+
+    def solved(gram: Array) -> tuple[Array, Array]:
+        inverse = np.linalg.pinv(gram[:-1, :-1] / scale, rcond=_BLIND, hermitian=True) / scale
+        return -(inverse @ gram[:-1, -1])[:n], np.diag(inverse)[:n]
+
+    (step, variance), moves = solved(whole), list[Array]()
+    for two in pairwise(sums):
+        without, wider = solved(whole - two[0] - two[1])
+        shift, chance = without - step, np.maximum(wider - variance, _KNOWN * wider)
+        moves.append(np.where(shift**2 > _MOST**2 * chance, shift, 0.0))
+    return np.array(moves).reshape(-1, n) * problem.magnitude
 
 
 def assumption_checks(
