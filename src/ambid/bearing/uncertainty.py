@@ -68,12 +68,11 @@ class Uncertainty:
     delay_sd: float | None  # standard deviation of an estimated delay in samples
     # (n, n), SI, covariance with the noise levels taken as known well: what `information` is for a long record
     fisher: Array
-    # (n,), SI, how far the parameters move when the data are used differently, where that is more than chance allows;
-    # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
+    # (n_ways, n), SI, how far the parameters move when the data are used differently, where that is more than chance
+    # allows; else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
     disagreement: Array
     bias: Array  # (n,), SI, what causes that the tests name have done to the estimate; part of all intervals
-    # (n_moves, n), SI, how far the estimate moves without bands that disagree, and to what facts without a fit say that
-    # contradict it; part of them too
+    # (n_facts, n), SI, how far the estimate moves to what facts without a fit say that contradict it; part of them too
     apart: Array
 
     @property
@@ -112,10 +111,9 @@ class Uncertainty:
         kept = np.eye(len(self.names)) - np.outer(gain, slope)
         own = sd**2 * np.outer(gain, gain)
         parts = {name: kept @ getattr(self, name) @ kept.T + own for name in ("information", "robust", "fisher")}
-        away = {name: kept @ getattr(self, name) for name in ("disagreement", "bias")}
+        away = {name: getattr(self, name) @ kept.T for name in ("disagreement", "bias", "apart")}
         values, weakest = weakest_direction(self.names, parts["information"], scale)
-        apart = self.apart @ kept.T
-        return replace(self, **parts, **away, apart=apart, scale=scale, singular_values=values, weakest=weakest)
+        return replace(self, **parts, **away, scale=scale, singular_values=values, weakest=weakest)
 
     def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
         """Return which parameters have a relative standard deviation below 25 %."""
@@ -149,7 +147,7 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
         weakest=weakest,
         delay_sd=delay_sd,
         fisher=(whole[:n, :n] + more) * unit,
-        disagreement=np.zeros(n),
+        disagreement=np.zeros((0, n)),
         bias=np.zeros(n),
         apart=np.zeros((0, n)),
     )

@@ -311,7 +311,7 @@ def _judged(
     checks = physical.innovation_checks(fit, products, spread, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     if robust:
-        spread = replace(spread, disagreement=moved.disagreement(), apart=physical.by_bands(fit))
+        spread = replace(spread, disagreement=np.vstack([moved.disagreement(), physical.by_bands(fit)]))
     freed = {name: free_one(fit, name) for name in problem.known}
     checks |= physical.assumption_checks(fit, spread, freed, delay_how)
     signals = signals_of(bench, problem.model)

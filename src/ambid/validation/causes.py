@@ -544,8 +544,8 @@ _TEXT = {
     "slow_current": "the current's sensor drifts. Measure its zero before and after, or record shorter",
     "amplifier_lag": "the coil's voltage follows the logged one late, as through a filter: an amplifier of small "
     "bandwidth. Log the coil's voltage, or excite more slowly",
-    "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a gain or the rate is. Check it, "
-    "or free it",
+    "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a gain or the rate is. Check "
+    "it, or free it",
     "sampling": "the voltage changes between samples, so that its log does not say what the coil got. Log every sample "
     "of the controller",
     "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",

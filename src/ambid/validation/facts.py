@@ -318,7 +318,7 @@ def informed(
     named = facts.get("causes")
     if named is not None and not named.passed and "sampling" in (named.cause, *named.alternatives):
         moves += [theta[name] * np.eye(n)[names.index(name)] for name in ("R", "L") if name in names]
-    spread = replace(spread, apart=np.vstack([spread.apart, *moves]))
+    spread = replace(spread, apart=np.array(moves).reshape(-1, n))
     single = rig.magnet is not None and rig.magnet.kind == "single"
     if weight is None or not (weight.passed and single) or "k_i" not in names:
         return fit, spread, None

@@ -266,7 +266,8 @@ def by_bands(fit: Fit) -> Array:
         without, wider = solved(whole - two[0] - two[1])
         shift, chance = without - step, np.maximum(wider - variance, _KNOWN * wider)
         moves.append(np.where(shift**2 > _MOST**2 * chance, shift, 0.0))
-    return np.array(moves).reshape(-1, n) * problem.magnitude
+    once = np.sqrt(0.5) * problem.magnitude  # each octave is left out twice
+    return np.asarray(np.array(moves).reshape(-1, n) * once)
 
 
 def assumption_checks(
