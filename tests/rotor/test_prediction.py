@@ -16,7 +16,7 @@ from ambid.record import Record
 from ambid.rotor.conclusion import numbers_of
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Point
-from ambid.rotor.prediction import predict_rotor, predictor_problem
+from ambid.rotor.prediction import predict_rotor, predictor_problem, with_low_passes
 from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -57,7 +57,9 @@ def test_the_predictor_finds_the_machine_within_its_intervals(once: tuple[Any, R
 
 
 def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
-    """Every number of the vector, the delays of two inputs and the level of every noise among them."""
+    """Every number of the vector, the delays of two inputs and the level of every noise among them, of a rotor lighter
+    than 1 kg, whose logarithm is negative, and of noise with low-pass parts of a force and a position.
+    """
     from ambid.estimation.likelihood import Workspace, innovations, linearise
 
     bench, record = once
@@ -68,7 +70,9 @@ def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
     theta |= {"mode1.A.z": 0.2, "mode1.B.z": -0.3, "mode1.A.z_sensor": 0.25, "mode1.B.z_sensor": -0.2}
     short = load_bench(record, rig)[0.0:0.01]
     at = Point(theta=theta, delays=np.array([1.0, 1.3, 2.2, 1.7]))
-    problem, vector = predictor_problem(short, model, rig.parameters, at, free=(1, 2))
+    at = replace(at, theta={**at.theta, "m": 0.6})
+    white = predictor_problem(short, model, rig.parameters, at, free=(1, 2))
+    problem, vector = with_low_passes(*white, ((0, 300.0), (len(model.disturbances) + 1, 50.0)), 1.0)
     work, weight = Workspace(problem), np.eye(8)
     slopes = linearise(problem, vector, weight, work)
     assert slopes is not None
@@ -81,6 +85,34 @@ def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
     e = innovations(problem, vector)
     assert e is not None
     assert slopes.r @ (slopes.J @ step) == pytest.approx(float(np.sum(e * along)), rel=1e-4)
+
+
+def test_coloured_forces_do_not_bend_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forces of a first-order low pass of 20 Hz, 2 N rms: white noise in their place moves k_x by 16 %. What turns with
+    the rotor leaves no line.
+    """
+    pole, bench = 2.0 * np.pi * 20.0, replace(truth.BENCHES["rigid-spin"], period=1.2, periods=1, excitation="full")
+    own = np.sqrt(np.tanh(0.5 * pole / bench.rate))  # rms of what a held noise of rms 1 is behind the low pass
+    plant = truth.plant
+
+    def slowed(b: Any) -> tuple[Any, Any, Any]:
+        A, B, C = plant(b)
+        push = B[:, 8:]
+        A = np.block([[-pole * np.eye(4), np.zeros((4, len(A)))], [push, A]])
+        B = np.vstack([np.pad(pole * np.eye(4), ((0, 0), (8, 0))), np.pad(B[:, :8], ((0, 0), (0, 4)))])
+        return A, B, np.pad(C, ((0, 0), (4, 0)))
+
+    monkeypatch.setattr(truth, "plant", slowed)
+    record = record_of(replace(bench, force_noise=2.0 / own), 4)
+    monkeypatch.undo()
+    _, theta = model_of(bench)
+    found = ambid.identify(record, free_rig(bench))
+    assert isinstance(found, RotorEstimate)
+    assert found.method == "predictor"
+    assert found.verdict.word == "usable", found.checks
+    for p in found.parameters:
+        assert abs(p.value - theta[p.name]) <= _FAR * p.sd, p
+    assert found.noise["ax_force"] == pytest.approx(2.0, rel=0.4)
 
 
 def test_both_estimators_agree_on_a_periodic_record() -> None:

@@ -67,6 +67,7 @@ class PredictorProblem:
     # their standard deviations, where they are not each of one parameter
     joint_priors: Callable[[Array], tuple[Array, Array]] | None = None
     extra: Array | None = None  # (n_samples, n_disturbances), known disturbances from each sample to the next, SI
+    unsteady: int = 0  # disturbances, the last ones, that have no constant part
 
     slices: Mapping[str, slice] = field(init=False)  # places of the groups in the vector
     taps: tuple[int, ...] = field(init=False)  # lags beyond `delay`, in samples, at which the input acts over one
@@ -83,7 +84,7 @@ class PredictorProblem:
             "physical": self.n_physical,
             "fraction": len(self.late) if self.fractional else 0,
             "noise": {"levels": n_d + n_y - 1, "gain": n * n_y, "given": 0}[self.noise],
-            "offset": n_d,
+            "offset": n_d - self.unsteady,
             "initial": n,
         }
         ends = list(accumulate(sizes.values(), initial=0))
@@ -362,7 +363,8 @@ def assemble(
     """
     sl = problem.slices
     theta, lag = problem.parameters(vector), problem.lags_at(vector)
-    possible = np.all(np.isfinite(vector)) and all(theta.get(name, 1.0) > 0 for name in ("m", "L"))
+    positive = (p.name for p in problem.model.parameters if p.name in ("m", "L"))  # a rotor's are logarithms, no specs
+    possible = np.all(np.isfinite(vector)) and all(theta.get(name, 1.0) > 0 for name in positive)
     if not possible or not np.all((lag > -1.0) & (lag < 2.0) & (problem.delay + lag >= 0.0)):
         return None
     try:
@@ -415,13 +417,14 @@ def _recursion(
     if not stable(F):
         return None
     extra = problem.extra is not None
-    M = np.hstack([F, step.inputs, *([step.known] if extra else []), K, (step.E @ offset)[:, None]])
+    n_o = offset.size
+    M = np.hstack([F, step.inputs, *([step.known] if extra else []), K, (step.E[:, :n_o] @ offset)[:, None]])
     dM = np.zeros((*M.shape, 0 if dK is None else problem.size))
     dE, dC = np.zeros((*step.E.shape, dM.shape[2])), None
     if dK is not None:
         n, first_y = F.shape[0], M.shape[1] - 1 - K.shape[1]
         for q, d in enumerate(step_slopes):  # physical parameters, then the delay
-            dM[:, :n, q], dM[:, -1, q] = d.A, d.E @ offset
+            dM[:, :n, q], dM[:, -1, q] = d.A, d.E[:, :n_o] @ offset
             dM[:, n:first_y, q] = np.hstack([d.inputs, d.known]) if extra else d.inputs
             dE[:, :, q] = d.E
         dC = _slopes_of_C(slopes, plant.C)
@@ -430,7 +433,7 @@ def _recursion(
         # dK holds physical parameters, delay and noise in the order of the vector
         dM[:, :n, : len(dK)] -= np.moveaxis(dK @ plant.C, 0, 2)
         dM[:, first_y:-1, : len(dK)] += np.moveaxis(dK, 0, 2)
-        dM[:, -1, sl["offset"]] = step.E
+        dM[:, -1, sl["offset"]] = step.E[:, :n_o]
     return Predictor(
         M=M,
         dM=dM,

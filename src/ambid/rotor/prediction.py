@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import (
     Fit,
+    Workspace,
+    evaluate,
     innovations,
     prior_rows,
     residual_blocks,
@@ -40,6 +43,10 @@ _REACH = 20  # samples within which a state shows in the outputs
 _REST = 4  # samples beside the longest delay that are left out at the start: fits with other delays see the same data
 _WHOLE = 0.01  # samples by which a delay that is estimated may miss a whole number however exact it is
 _ROUNDING = 1e-9
+_COLOURED = ("_force", "_voltage", "_position", "_current")  # kinds of sources
+_SLOWEST, _POLES = 4.0, 7  # pole of coloured noise times the record, that is tried first, and how many up to the rate
+_OVER = (0.0, 2.0, 4.0)  # logarithm of its level over that of the white part, at the start
+_FACTORS, _MOVES = (0.5, 0.7, 0.9, 1.1, 1.4, 2.0), 4  # of a pole, to find a likelier one, and how often
 _LEVEL = -2.0  # log level of disturbances at the start
 
 
@@ -57,6 +64,8 @@ class Searched:
 
     unknowns: Unknowns
     base: Point
+    # sources of noise (disturbances, then outputs) that have a low-pass part beside the white one, and its pole, rad/s
+    colours: tuple[tuple[int, float], ...] = ()
     name: str = "rotor"
     summary: str = "rotor by the numbers that are searched"
     parameters: tuple[ParameterSpec, ...] = field(default=())
@@ -78,13 +87,19 @@ class Searched:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Of the rotor."""
-        return self.rotor.states
+        """Of the rotor, and what low passes hold."""
+        return (*self.rotor.states, *self.slow)
 
     @property
     def disturbances(self) -> tuple[str, ...]:
-        """Of the rotor."""
-        return self.rotor.disturbances
+        """Of the rotor, and what drives low passes."""
+        return (*self.rotor.disturbances, *self.slow)
+
+    @property
+    def slow(self) -> list[str]:
+        """Low passes."""
+        sources = (*self.rotor.disturbances, *self.rotor.outputs)
+        return [f"{sources[of]}.slow{k}" for k, (of, _) in enumerate(self.colours)]
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -98,7 +113,24 @@ class Searched:
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return the rotor's matrices."""
-        return self.rotor.matrices(self.unknowns.unpack(self.vector(theta), self.base.theta, self.base.delays)[0])
+        at = self.unknowns.unpack(self.vector(theta), self.base.theta, self.base.delays)[0]
+        return self._coloured(self.rotor.matrices(at))
+
+    def _coloured(self, space: StateSpace, *, slope: bool = False) -> StateSpace:
+        """Return matrices, or slopes of them, with low passes c' = p (d - c) of sources beside the rotor."""
+        if not self.colours:
+            return space
+        (n, n_d), k = space.E.shape, len(self.colours)
+        A, E = np.pad(space.A, (0, k)), np.pad(space.E, (0, k))
+        B, C = np.pad(space.B, ((0, k), (0, 0))), np.pad(space.C, ((0, 0), (0, k)))
+        for j, (of, pole) in enumerate(self.colours):
+            if of < n_d:
+                A[:n, n + j] = space.E[:, of]
+            elif not slope:
+                C[of - n_d, n + j] = 1.0
+            if not slope:
+                A[n + j, n + j], E[n + j, n_d + j] = -pole, pole
+        return StateSpace(A=A, B=B, E=E, C=C)
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return the rotor's derivative by the chain rule."""
@@ -108,7 +140,7 @@ class Searched:
         column = chain[: len(names), self.unknowns.names.index(parameter)]
         parts = [(x, self.rotor.derivative(at, name)) for name, x in zip(names, column.tolist(), strict=True) if x]
         A, B, E, C = (sum(x * getattr(d, which) for x, d in parts) for which in "ABEC")
-        return StateSpace(A=A, B=B, E=E, C=C)
+        return self._coloured(StateSpace(A=A, B=B, E=E, C=C), slope=True)
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return one for what may be zero: it is over its size already."""
@@ -144,7 +176,7 @@ class _Erring(Searched):
                 k = self.outputs.index(error.channel)
                 row = {"gain": space.C[k], "lag": -space.C[k] @ space.A}
                 moved.C[k] += row[error.kind] if error.kind in row else space.C[self.outputs.index(error.other)]
-        return moved
+        return self._coloured(moved, slope=True)
 
 
 def predictor_scores(found: PredictorFit) -> list[Score]:
@@ -153,7 +185,9 @@ def predictor_scores(found: PredictorFit) -> list[Score]:
     assert isinstance(searched, Searched)
     causes = {c.name: c for c in causes_of(searched.unknowns) if c.errors}
     old, n, more = fit.problem, fit.problem.n_physical, len(causes)
-    erring = _Erring(unknowns=searched.unknowns, base=searched.base, causes=causes)
+    erring = _Erring(
+        unknowns=searched.unknowns, base=searched.base, colours=searched.colours, causes=causes,
+    )  # fmt: skip
     problem = replace(
         old, model=erring, estimated=(*old.estimated, *causes), magnitude=np.append(old.magnitude, np.ones(more)),
         prior_mean=np.append(old.prior_mean, np.zeros(more)), prior_sd=np.append(old.prior_sd, np.full(more, np.inf)),
@@ -230,11 +264,15 @@ def predict_rotor(
     ) -> tuple[PredictorProblem, Array]:
         problem, vector = predictor_problem(record, model, parameters, point, free, skip=skip)
         if last is not None:  # offsets and first state follow by themselves
+            scales = last.problem.scales
+            rest = scales.disturbance[: len(model.disturbances)]
+            problem = replace(problem, scales=replace(scales, state=problem.scales.state, disturbance=rest))
+            problem, vector = with_low_passes(problem, vector, searched_of(last).colours)
             vector[problem.slices["noise"]] = last.vector[last.problem.slices["noise"]]
-            problem = replace(problem, scales=replace(last.problem.scales, state=problem.scales.state))
         return problem, vector
 
     fit = _search(*problem_at(found.at_speed(speed), replace(at, delays=near)), tick)
+    fit = _coloured(fit, lambda x: predictor_scores(_ended(x, spectra, speed)), lambda: tick("fit", 0.7))
     while (more := starter.one_more(experiments, _rotor_of(fit), _point_of(fit))) is not None:
         price = float(np.log(fit.problem.y.size)) * (3 + len(model.places))
         trial = search(*problem_at(more[0].at_speed(speed), replace(more[1], delays=near), last=fit))
@@ -281,6 +319,68 @@ def predictor_problem(
     vector[problem.slices["fraction"]] = (at.delays - whole)[list(free)]
     vector[problem.slices["noise"]] = problem.noise_center
     return problem, vector
+
+
+def with_low_passes(
+    problem: PredictorProblem, vector: Array, colours: tuple[tuple[int, float], ...], over: float = 0.0
+) -> tuple[PredictorProblem, Array]:
+    """Return a problem with further low passes, and its vector with their log levels `over` those of their sources."""
+    searched, scales, k = problem.model, problem.scales, len(colours)
+    assert isinstance(searched, Searched)
+    of, n_d, end = [j for j, _ in colours], len(searched.rotor.disturbances), len(searched.disturbances)
+    slow = np.concatenate([scales.disturbance[:n_d], scales.output])[of]
+    noise = vector[problem.slices["noise"]]
+    levels = np.concatenate([noise[:n_d], [0.0], noise[end:]])[of] + over
+    more = replace(
+        problem, model=replace(searched, colours=(*searched.colours, *colours)), unsteady=problem.unsteady + k,
+        scales=replace(scales, state=np.append(scales.state, slow), disturbance=np.append(scales.disturbance, slow)),
+        noise_center=np.insert(problem.noise_center, end, np.full(k, _LEVEL)),
+    )  # fmt: skip
+    return more, np.append(np.insert(vector, problem.slices["noise"].start + end, levels), np.zeros(k))
+
+
+def _coloured(fit: Fit, causes_of: Callable[[Fit], list[Score]], tick: Callable[[], None]) -> Fit:
+    """Return a fit whose noise has low-pass parts of one pole in all sources of a kind, kind after kind, where the
+    likelihood wants them, and more than it wants any cause that the innovations may have.
+    """
+    searched, poles = searched_of(fit), np.geomspace(_SLOWEST / fit.problem.n_used, 1.0, _POLES) * fit.problem.rate_hz
+    sources = (*searched.rotor.disturbances, *searched.outputs)
+    kinds = [[k for k, s in enumerate(sources) if q in s] for q in _COLOURED]
+    while True:
+        had = {k for k, _ in searched_of(fit).colours}
+        trials = list[tuple[float, PredictorProblem, Array]]()
+        for kind, pole in product((x for x in kinds if x and had.isdisjoint(x)), poles.tolist()):
+            pairs = [with_low_passes(fit.problem, fit.vector, tuple((k, pole) for k in kind), x) for x in _OVER]
+            work = Workspace(pairs[0][0])
+            trials += [(evaluate(q, v, work)[0], q, v) for q, v in pairs]
+        value, problem, vector = min(trials, key=lambda t: t[0], default=(np.inf, fit.problem, fit.vector))
+        if not value < fit.criterion:
+            return fit
+        more = _with_poles(search(problem, vector, tick=tick), len(searched.rotor.disturbances), tick)
+        price = (len(problem.model.disturbances) - len(fit.problem.model.disturbances) + 1) * np.log(fit.problem.y.size)
+        gain = fit.criterion - more.criterion
+        if more.status == "failed" or not gain > max([price, *(s.gain for s in causes_of(fit)[:1])]):
+            return fit
+        fit = more
+
+
+def _with_poles(fit: Fit, n_d: int, tick: Callable[[], None]) -> Fit:
+    """Return a fit at the pole of its last low passes that is likeliest."""
+    for _ in range(_MOVES):
+        searched, trials = searched_of(fit), list[tuple[float, PredictorProblem, Array]]()
+        colours, last = searched.colours, searched.colours[-1][1]
+        own = [k for k, (_, pole) in enumerate(colours) if pole == last]
+        places = [fit.problem.slices["noise"].start + n_d + k for k in own]
+        for factor, asymptote in product(_FACTORS, (0.0, 1.0)):
+            moved = tuple((of, p * factor if k in own else p) for k, (of, p) in enumerate(colours))
+            problem, v = replace(fit.problem, model=replace(searched, colours=moved)), fit.vector.copy()
+            v[places] -= asymptote * np.log(factor)
+            trials.append((evaluate(problem, v, fit.work)[0], problem, v))
+        value, problem, vector = min(trials, key=lambda t: t[0])
+        if not value < fit.criterion - 1.0:
+            break
+        fit = search(problem, vector, tick=tick)
+    return fit
 
 
 def _joint_priors(searched: Searched) -> Callable[[Array], tuple[Array, Array]]:
@@ -357,11 +457,16 @@ def _late(u: Array, delays: NDArray[np.intp]) -> Array:
     return out
 
 
-def _rotor_of(fit: Fit) -> RotorModel:
-    """Return the rotor of a fit, with its modes."""
+def searched_of(fit: Fit) -> Searched:
+    """Return the model of a fit."""
     searched = fit.problem.model
     assert isinstance(searched, Searched)
-    return searched.rotor
+    return searched
+
+
+def _rotor_of(fit: Fit) -> RotorModel:
+    """Return the rotor of a fit, with its modes."""
+    return searched_of(fit).rotor
 
 
 def _point_of(fit: Fit) -> Point:

@@ -134,7 +134,7 @@ def _differences(x: Array) -> Array:
     both = energy[n - shifts] + energy[n] - energy[shifts]
     d = np.divide(both - 2.0 * products, both, out=np.ones(n), where=both > 1e-12 * energy[n])
     S = np.abs(F[1:]) ** 2
-    independent = float(np.sum(S) ** 2 / np.sum(S**2)) * 2.0 / size
+    independent = float(np.sum(S) ** 2 / max(np.sum(S**2), 1e-300)) * 2.0 / size  # an idle stretch has none
     left = n - shifts
     enough = (left >= shifts) | ((left >= shifts / 32) & (left * independent >= 16))
     return np.asarray(np.where(enough, d, 1.0))

@@ -16,15 +16,16 @@ from ambid.bearing.multistart import Signals
 from ambid.bearing.sizes import check_units
 from ambid.bearing.uncertainty import noise_levels
 from ambid.estimation.estimate import Check, OutputFit
-from ambid.estimation.likelihood import innovations
+from ambid.estimation.likelihood import Fit, innovations
 from ambid.estimation.predictor import assemble
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
 from ambid.rotor.conclusion import Evidence, shifts_of
-from ambid.rotor.prediction import PredictorFit, predictor_scores
+from ambid.rotor.prediction import PredictorFit, predictor_scores, searched_of
 from ambid.rotor.scores import agreement_checks, suspects
+from ambid.rotor.spectra import beside_harmonics
 from ambid.validation.physical import innovation_products, innovation_tests
 from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
 
@@ -32,18 +33,17 @@ from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
 def of_predictor(found: PredictorFit) -> Evidence:
     """Return the evidence of innovations: score tests of whiteness and against past inputs, one-step fit, levels."""
     fit, problem = found.fit, found.fit.problem
-    predictor, e = assemble(problem, fit.vector, with_derivatives=False), innovations(problem, fit.vector, fit.work)
-    if predictor is None or e is None:
+    e = innovations(problem, fit.vector, fit.work)
+    if e is None:
         raise ValueError("the fit has no predictor; it has failed")
     white, past = innovation_tests(fit, innovation_products(fit, e))
-    disturbance, sensor = noise_levels(fit, predictor)
     e = e * problem.scales.output
     share, size = fit_of(e, problem.y[problem.skip :]), np.sqrt(np.mean(e**2, axis=0))
     causes = predictor_scores(found)
     checks = {"residuals_white": white_check(white), "residuals_uncorrelated": uncorrelated_check(past)}
     return Evidence(
         method="predictor",
-        noise={**sensor, **disturbance},
+        noise=_noise(fit),
         fit={
             role: OutputFit(one_step=float(a), simulation=None, innovation_sd=float(b))
             for role, a, b in zip(found.model.outputs, share, size, strict=True)
@@ -52,9 +52,23 @@ def of_predictor(found: PredictorFit) -> Evidence:
         checks={
             **checks,
             **_asked(agreement_checks(causes, found.model)),
-            **({} if suspects(causes) else _line_check(e, found.model, problem.rate_hz)),
+            **({} if suspects(causes) else _line_check(e, found, problem.rate_hz)),
         },
     )
+
+
+def _noise(fit: Fit) -> dict[str, float]:
+    """Return the rms of every source, SI: of its white part and its low-pass ones."""
+    problem, searched = fit.problem, searched_of(fit)
+    predictor = assemble(problem, fit.vector, with_derivatives=False)
+    assert predictor is not None
+    disturbance, sensor = noise_levels(fit, predictor)
+    rms = {**sensor, **disturbance}
+    sources = (*searched.rotor.disturbances, *searched.outputs)
+    square = {name: rms[name] ** 2 for name in (*searched.outputs, *searched.rotor.disturbances)}
+    for (of, pole), name in zip(searched.colours, searched.slow, strict=True):  # held noise through a low pass
+        square[sources[of]] += rms[name] ** 2 * np.tanh(0.5 * pole / problem.rate_hz)
+    return {name: float(np.sqrt(x)) for name, x in square.items()}
 
 
 def _asked(checks: dict[str, Check]) -> dict[str, Check]:
@@ -70,18 +84,22 @@ _CHANCE = 1e-6  # probability below which a line counts as seen
 _NEAR, _NARROW = 12, 0.8  # frequencies on either side, and what part of their power is of a line
 
 
-def _line_check(e: Array, plant: RotorModel, rate_hz: float) -> dict[str, Check]:
-    """Name the line of which innovations hold most, if there is one: power at a single frequency, over the median."""
+def _line_check(e: Array, found: PredictorFit, rate_hz: float) -> dict[str, Check]:
+    """Name the line of which innovations hold most, if there is one: power at a single frequency, over the median. Not
+    at harmonics of the speed: what was taken out of inputs and outputs there differs by how each began.
+    """
     n, n_y = e.shape
     power = np.abs(np.fft.rfft(e * np.hanning(n)[:, None], axis=0)[3 : n // 2]) ** 2
     power /= np.median(power, axis=0) / np.log(2.0)  # of an exponential
+    frequencies = rate_hz / n * np.arange(3, n // 2)
+    power[beside_harmonics(frequencies, found.speeds[0] / (2.0 * np.pi), 2.0 * rate_hz / n)] = 1.0
     whole = power.sum(axis=1)
     j = int(np.argmax(whole))
     over = whole[max(j - _NEAR, 0) : j + _NEAR + 1] - n_y
     narrow = float(np.sum(whole[max(j - 1, 0) : j + 2] - n_y)) > _NARROW * float(over.sum())
     if not narrow or whole.size * chi_squared_tail(2 * n_y, 2.0 * float(whole[j])) > _CHANCE:
         return {}
-    frequency, channel = (j + 3) * rate_hz / n, plant.outputs[int(np.argmax(power[j]))]
+    frequency, channel = float(frequencies[j]), found.model.outputs[int(np.argmax(power[j]))]
     check = Check(
         passed=False, cause="line", size=frequency, alternatives=("mode",),
         detail=f"a line at {frequency:.4g} Hz stands in the innovations, most in {channel}: hum, motion of the base, a "
