@@ -112,6 +112,7 @@ def test_coloured_forces_do_not_bend_the_machine(monkeypatch: pytest.MonkeyPatch
     assert found.verdict.word == "usable", found.checks
     for p in found.parameters:
         assert abs(p.value - theta[p.name]) <= _FAR * p.sd, p
+    assert "noise of each force has a low-pass part" in found.checks["residuals_white"].detail
     assert found.noise["ax_force"] == pytest.approx(2.0, rel=0.4)
 
 

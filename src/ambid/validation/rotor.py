@@ -40,7 +40,7 @@ def of_predictor(found: PredictorFit) -> Evidence:
     e = e * problem.scales.output
     share, size = fit_of(e, problem.y[problem.skip :]), np.sqrt(np.mean(e**2, axis=0))
     causes = predictor_scores(found)
-    checks = {"residuals_white": white_check(white), "residuals_uncorrelated": uncorrelated_check(past)}
+    checks = {"residuals_white": _told(white_check(white), fit), "residuals_uncorrelated": uncorrelated_check(past)}
     return Evidence(
         method="predictor",
         noise=_noise(fit),
@@ -55,6 +55,15 @@ def of_predictor(found: PredictorFit) -> Evidence:
             **({} if suspects(causes) else _line_check(e, found, problem.rate_hz)),
         },
     )
+
+
+def _told(check: Check, fit: Fit) -> Check:
+    """Return a check of noise that says what colour it has in the model."""
+    searched = searched_of(fit)
+    sources = (*searched.rotor.disturbances, *searched.outputs)
+    poles = {sources[of].rpartition("_")[2].rstrip("0123456789"): pole / (2.0 * np.pi) for of, pole in searched.colours}
+    words = " and ".join(f"noise of each {kind} has a low-pass part of {pole:.3g} Hz" for kind, pole in poles.items())
+    return replace(check, detail=f"{check.detail}; {words}") if words else check
 
 
 def _noise(fit: Fit) -> dict[str, float]:
