@@ -272,13 +272,14 @@ def predict_rotor(
         return problem, vector
 
     fit = _search(*problem_at(found.at_speed(speed), replace(at, delays=near)), tick)
-    fit = _coloured(fit, lambda x: predictor_scores(_ended(x, spectra, speed)), lambda: tick("fit", 0.7))
     while (more := starter.one_more(experiments, _rotor_of(fit), _point_of(fit))) is not None:
         price = float(np.log(fit.problem.y.size)) * (3 + len(model.places))
         trial = search(*problem_at(more[0].at_speed(speed), replace(more[1], delays=near), last=fit))
         if trial.status == "failed" or not fit.criterion - trial.criterion > price:
             break
         fit = trial
+    # after the modes, which it would stand in for
+    fit = _coloured(fit, lambda x: predictor_scores(_ended(x, spectra, speed)), lambda: tick("fit", 0.7))
     free = tuple(k for k, d in enumerate(delays) if d is None)
     if free:
         fit = _with_delays(fit, free, problem_at, lambda: tick("fit", 0.9))
