@@ -325,7 +325,8 @@ def _judged(
             from ambid.control.curvature import magnet_checks
             from ambid.control.experiment import MOST
 
-            sd = spread.standard_deviations(robust=robust)
+            by_refits = replace(spread, disagreement=spread.disagreement[:1])  # bands bend too
+            sd = by_refits.standard_deviations(robust=robust)
             checks |= magnet_checks(fit, e, rig, means, sd)
             curved = checks.get("curvature")
         if curved is not None:
