@@ -33,11 +33,13 @@ from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import OneAxis, Parameter
 
 _NEAR_WHOLE = 0.1  # distance of a delay from a whole number at which the whole number is tried
+_FASTEST = 2.0  # samples that a drifting force lasts at least
 _SHORT = 12  # iterations with which a whole delay is tried
 _TRIED = 15  # iterations with which laws are compared
 _LONG = 30  # iterations with which a richer law is
 _HINT = 1e-3  # of the leakage: how much it rises where only its promise is asked
 _SATURATES = 0.2  # of the start value of sigma, likewise
+_AT = 0.02  # of a bound at which a number stands, in its logarithm
 _PLAIN = 3.0  # standard deviations from which saturation is known
 _KNEES = (0.4, 1.0, 3.0)  # times the knee at which a search begins
 _LIKELY = 0.5  # share of its price that a part of the law must promise to be searched
@@ -94,8 +96,6 @@ def estimate_bearing(
             fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
             near = _CLOSE if fit.status == "converged" else _FAR
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
-        if white is not None and "drift" in extend:
-            fit = _drifting(fit, short, parameters, white, again)
         if "saturation" in extend:
             richer = _extended(fit, "saturation", parameters, short, linear, again)
             same = richer.problem.law == fit.problem.law
@@ -106,6 +106,8 @@ def estimate_bearing(
             lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
             search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
         )  # fmt: skip
+        if white is not None and "drift" in extend:
+            fit = _drifting(fit, short, white, again)
     if fit.status == "failed":
         raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
     return fit
@@ -166,6 +168,12 @@ def _first(
         noise_center=np.zeros((len(records), len(LEVELS))),
         skip=int(max(delays.values())) + 8,
     )
+    tau = next(n.value for n in problem.numbers if n.name == "tau")
+    if drift and tau * max(delays) < _FASTEST:
+        raise EstimationError(
+            f"magnet.parameters.tau is {tau:.3g} s; a force that is forgotten within {_FASTEST:g} samples is noise. "
+            "Give more, or omit it"
+        )
     problem = with_noise(problem, linear.values)
     return search(problem, problem.start(), iterations=_TRIED, tick=tick)
 
@@ -209,15 +217,15 @@ def _extended(
 
 
 def _drifting(
-    fit: BearingFit, short: Sequence[BearingRecord], parameters: Mapping[str, Parameter],
-    white: Callable[[BearingFit], bool], tick: Tick | None,
-) -> BearingFit:  # fmt: skip
+    fit: BearingFit, short: Sequence[BearingRecord], white: Callable[[BearingFit], bool], tick: Tick | None
+) -> BearingFit:
     """Return a fit with a force and a voltage that drift beside what it has, where that pays (BIC) and leaves white
-    residuals, on the `short` records already: it would take up any misfit.
+    residuals, on the `short` records already, or it would take up any misfit; not where the force is as slow as it may
+    be, as it would stand for a law that is wrong.
     """
-    if fit.problem.drift or fit.status == "failed":
+    if fit.problem.drift or fit.status != "converged":
         return fit
-    numbers = _acting(fit.problem.numbers, parameters, eddy=fit.problem.eddy, drift=True)
+    numbers = tuple(replace(n, estimated=True) if n.name == "tau" else n for n in fit.problem.numbers)
     problem = replace(fit.problem, drift=True, numbers=numbers)
     price = (problem.size - fit.problem.size) * float(np.log(problem.n_used))
     begun = _carried(fit, problem)
@@ -229,7 +237,7 @@ def _drifting(
         return fit
     more = search(problem, begun, iterations=_LONG, tick=tick)
     pays = more.status == "converged" and fit.criterion - more.criterion > price
-    return more if pays and white(more) else fit
+    return more if pays and np.all(more.vector < problem.upper() - _AT) and white(more) else fit
 
 
 def _saturates(fit: BearingFit) -> bool:
@@ -448,7 +456,7 @@ def start_numbers(
         "m": mass,
         "g": gravity,
         "a": 2.0 * np.pi * 200.0,
-        "tau": _TAU * max(r.u.size / r.rate_hz for r in free),
+        "tau": _TAU * min(r.u.size / r.rate_hz for r in free),
         "sigma": 0.05 / np.max(current**2),
     }
     guess |= dict.fromkeys(("x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"), 0.0)

@@ -22,6 +22,7 @@ from ambid.estimation.search import search as descend
 _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
 _SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
+_HUGE = 1e100  # rows of a likelihood that has lost the record
 _LEFT = 1.0  # and below which it has converged where rounding leaves no way down
 _SEARCHING = "identify"
 _ABOUT = 4  # samples before and after a beginning that show where the rotor is and how fast it moves
@@ -186,7 +187,9 @@ def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]
             z[3] = problem.law.table(z[:1], z[2:3], begun)[0][0, 0]
             P[3, 3] += z[3] ** 2
     if flags[3]:
-        P[-2, -2], P[-1, -1] = (10.0 * noise[2]) ** 2, noise[5] ** 2  # v_offset is the voltage's beginning
+        walk = begin > problem.skip or r != next(k for k, x in enumerate(problem.records) if not x.held)
+        P[-2, -2] = max((10.0 * noise[2]) ** 2, 0.5 * noise[4] ** 2 * begun["tau"] * rate)
+        P[-1, -1] = float(np.var(record.u)) if walk else noise[5] ** 2  # v_offset is where the voltage begins to walk
     return z, P
 
 
@@ -258,7 +261,7 @@ def _of_record(
     width = problem.size + 2 * len(problem.settled)
     own, blocks, columns = np.zeros((-(-n // stretch), width)), list[Array](), np.zeros(0, dtype=np.int64)
     for part in sweep(problem, vector, r, innovations, slopes=True, delays=True):
-        if part is None or not np.all(np.isfinite(part.rows)):
+        if part is None or not np.all(np.abs(part.rows) < _HUGE):
             return None
         columns, m = part.columns, part.rows.shape[0]
         for b in range(part.first // stretch, (part.first + m - 1) // stretch + 1):

@@ -180,7 +180,8 @@ class BearingProblem:
             "tau": min(r.u.size / r.rate_hz for r in free) / FORGETS,
         }
         bounds = np.full(self.size, np.inf)
-        bounds[: len(self.estimated)] = [np.log(most.get(n.name, np.inf)) for n in self.estimated]
+        said = [np.inf if np.isfinite(n.prior_sd) else most.get(n.name, np.inf) for n in self.estimated]
+        bounds[: len(said)] = np.log(said)
         return bounds
 
     def values(self, vector: Array) -> dict[str, float]:

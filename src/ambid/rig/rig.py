@@ -190,6 +190,7 @@ class RigMagnet:
             "saturation = false": ("sigma",) if self.saturation is False else (),
             "rise = false": ("L_rise", "i_knee") if self.rise is False else (),
             "eddy = false": () if self.eddy else ("a",),
+            "drift = false": () if self.drift else ("tau",),
         }
         for p in self.parameters:
             for entry, names in excluded.items():

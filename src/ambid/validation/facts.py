@@ -241,26 +241,23 @@ def _left(y: Array, rows: Array) -> float:
     return float(rest @ rest)
 
 
-def ohm(
-    record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1, offset: bool = False
-) -> Check:
+def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1, offset: float = 0.0) -> Check:
     """Compare R with the means of a record, `mean` and its sd, ohm; one `of` several records: chance lets the farthest
-    of all pass as often as a single one. `offset`: one of the voltage was estimated beside R; of a stage's size it
-    explains the difference, `size`, which the intervals of both then have to hold.
+    of all pass as often as a single one. `offset`: of the voltage, V, estimated beside R; where it explains the
+    difference and is not larger than a stage's, both intervals have to hold that, `size`.
     """
     far = (R - mean) / float(np.hypot(sd, mean_sd))
     within = 2.0 * NormalDist().cdf(_FAR) - 1.0
-    passed = abs(far) <= NormalDist().inv_cdf(0.5 + 0.5 * within ** (1.0 / of))
+    limit = NormalDist().inv_cdf(0.5 + 0.5 * within ** (1.0 / of))
+    passed = abs(far) <= limit
     i0 = float(record["current"].values.mean())
     detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
     if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS and mean > -_FURTHER * mean_sd:
         passed, detail = True, f"{detail}: the means are those of offsets"
     apart = not passed
-    if apart and offset and abs(mean / R - 1.0) < _STAGE:
-        passed, detail = (
-            True,
-            f"{detail}: the offset of the voltage explains the difference, and both intervals hold it",
-        )
+    left = far - offset / i0 / float(np.hypot(sd, mean_sd)) if i0 else far
+    if apart and abs(left) <= limit and abs(mean / R - 1.0) < _STAGE:
+        passed, detail = True, f"{detail}: the offset of the voltage explains it, and the intervals of both hold it"
     if not passed:
         detail += (
             f": {abs(far):.2g} sd apart. An offset of {(mean - R) * i0:+.2g} V or {i0 * (1.0 - mean / R):+.2g} A, or a "
