@@ -441,7 +441,8 @@ def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> 
         *warnings_of(fit, checks, "scatter over the records, disagreement of refits" if robust else ""),
         *_unseen(fit),
     ]
-    if checks["ohm"].passed and checks["ohm"].size is not None:
+    means = checks.get("ohm")
+    if means is not None and means.passed and means.size is not None:
         warnings.append("R and v_offset are only known together, as far as the means of voltage and current go")
     if fit.problem.drift:
         warnings.append("a force and a voltage that drift absorb what the law does not explain")
