@@ -13,4 +13,5 @@ def test_nothing_acknowledged_is_lost_by_a_kill(tmp_path):
     assert sum(k.acknowledged > 0 for k in found) > CASES / 2  # most were killed under load
     assert sum(k.acknowledged for k in found) > 300 * CASES
     assert sum(k.when == "while recording" for k in found) > CASES / 2
-    assert any(k.recovered > k.acknowledged for k in found)  # a kill takes less than a power cut
+    if ALL:  # of a dozen kills on a quiet machine often none comes between a write and its acknowledgement
+        assert any(k.recovered > k.acknowledged for k in found)  # a kill takes less than a power cut
