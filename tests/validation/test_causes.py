@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -331,5 +333,16 @@ def test_a_weighed_value_is_blamed_where_it_can_be_what_is_wrong(far, every, nam
         found, {"estimates_agree": failed, "fixed_agree": failed}, np.ones(1), robust=True, record=record
     )["causes"]
     assert (check.cause, check.alternatives) == (named, also)
+    assert check.size == (None if named == "sampling" else 19.0)  # which is the fixed value's
     if named == "fixed_value":
         assert "the fixed m fits better +19 (SI) from where it is" in check.detail
+
+
+def test_intervals_hold_the_shift_of_the_cause_that_is_named_before_a_far_value_of_larger_gain():
+    found = [cause("fixed_value", 250.0, channel="m", far=True), cause("friction", 100.0)]
+    found[1] = replace(found[1], shift=np.full(1, -11.0))
+    assert abs(named_bias(found, np.zeros(1))) == 11.0
+    failed = Check(passed=False, detail="", values={"gain": 250.0})
+    passed = {"estimates_agree": Check(passed=True, detail=""), "fixed_agree": failed}
+    check = causes_check(found, passed, np.ones(1), robust=True, record=None)["causes"]
+    assert check.cause == "friction"

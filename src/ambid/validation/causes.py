@@ -181,6 +181,11 @@ def _fixed(fit: Fit, rig: Rig, freed: Freed) -> Iterator[Cause]:
             )
 
 
+def _sure(found: Sequence[Cause]) -> list[Cause]:
+    """Return the causes that are seen, the one to name first; fixed values far from where they are come last."""
+    return sorted((c for c in found if c.p < _CHANCE), key=lambda c: c.far)
+
+
 def _net(cause: Cause) -> float:
     """What a cause costs, less what it explains."""
     return _PENALTY * cause.sizes.size - cause.gain
@@ -209,7 +214,7 @@ def extended(
     predictor. Sizes and parameters are found in turn, and the information of the parameters is what is left beside the
     sizes.
     """
-    sure = [c for c in found if c.p < _CHANCE and c.name not in _KNOWN]
+    sure = [c for c in _sure(found) if c.name not in _KNOWN]
     if not sure or fit.problem.n_used > _LONGEST:
         return None
     cause = sure[0]
@@ -560,7 +565,7 @@ _TEXT = {
 
 def named_bias(found: Sequence[Cause], known: Array) -> Array:
     """Return the largest shift of each parameter by the strongest cause and those about as strong, or as is `known`."""
-    sure = [c for c in found if c.p < _CHANCE]
+    sure = _sure(found)
     return farthest([known, *(c.shift for c in sure if c.gain > _ALIKE * sure[0].gain)])
 
 
@@ -573,7 +578,7 @@ def causes_check(
     (n_physical,), SI; a cause that moves no number by more than 1.5 of them is told and does no harm, unless other
     tests of the innovations failed (`robust`).
     """
-    sure = sorted((c for c in found if c.p < _CHANCE), key=lambda c: c.far)
+    sure = _sure(found)
     if not sure:
         return {"causes": Check(passed=True, detail="no cause that was looked for shows in the innovations")}
     if not robust and all(np.all(np.abs(c.shift) <= _HARMLESS * sd) for c in sure):
@@ -600,7 +605,7 @@ def causes_check(
     net = first.gain - _PENALTY * first.sizes.size
     named = Check(
         passed=False, p=first.p, values={"gain": first.gain}, detail=f"{text} (chi-squared {first.gain:.3g})",
-        grave=grave, cause=name, size=first.size, alternatives=others,
+        grave=grave, cause=name, size=first.size if name == first.name else None, alternatives=others,
     )  # fmt: skip
     fixed = checks["fixed_agree"]
     if fixed.passed or fixed.values["gain"] - _PENALTY >= net:
