@@ -141,6 +141,20 @@ def test_a_file_that_was_cut_anywhere_gives_its_whole_lines(track, file, tmp_pat
         read_track(cut)
 
 
+@pytest.mark.parametrize("kind", ["excluded", "restored"])
+def test_events_of_the_release_before_on_sensors_are_read_as_disturbances(track, file, kind):
+    event = Event(kind=kind, t=0.1, why="position_2 disagrees", parameter="position_2")
+    old = replace(track, lines=(replace(track.lines[0], events=(event,)), *track.lines[1:]))
+    rows = [header_json(old.header), *map(line_json_of_the_release_before, old.lines)]
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+    assert read_track(file).lines[0].events == (replace(event, kind="disturbed"),)
+
+
+def line_json_of_the_release_before(line):
+    events = [event_json(e) for e in line.events]
+    return {**line_json(replace(line, events=())), "event": events[0] if events else None, "events": events}
+
+
 def changed(text, row, old, new):
     rows = text.split("\n")
     assert old in rows[row]

@@ -342,7 +342,9 @@ def _line_or_summary(document: Mapping[str, Any]) -> TrackLine | TrackSummary:
 
 
 def _event(e: Mapping[str, Any]) -> dict[str, Any]:
-    return {"t": None, "why": "", **e}
+    """Return the entries of an event; those of release 1.0 on sensors out of use are read as disturbances."""
+    former = {"kind": "disturbed"} if e.get("kind") in ("excluded", "restored") else {}
+    return {"t": None, "why": "", **e, **former}
 
 
 _TOLD = 200  # events that are kept
@@ -350,7 +352,7 @@ _NOTABLE = ("change", "disturbed", "reverted", "operator")  # told one by one; o
 
 
 class LiveState:
-    """State of a run, to be drawn; one thread adds, another may read: `header`; the last `line`, None before the first;
+    """State of a run, to be told; one thread adds, another may read: `header`; the last `line`, None before the first;
     `tally`; `lag_s`: from a block's last sample to the end of its work, s, None if not measured; `begin_s`: begin of
     the first reporting interval, s of record.
     """
