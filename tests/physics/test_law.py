@@ -13,10 +13,9 @@ from ambid.control.controller import controller_of_loop
 from ambid.errors import ModelError, RigError
 from ambid.physics.law import StateLaw, beside
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, load_rig, rig_text
 from ambid.rig.draft import rig_of_preset
-from ambid.simulation.plant import closed_loop_poles, law_on
+from ambid.simulation.plant import closed_loop_poles
 
 
 def as_law(rig: Rig) -> Rig:
@@ -138,22 +137,3 @@ def test_gains_and_matrices_exclude_each_other(tmp_path: Path) -> None:
         (tmp_path / "rig.toml").write_text(text.replace(old, new))
         with pytest.raises(RigError, match=match):
             load_rig(tmp_path / "rig.toml")
-
-
-def test_the_law_nearest_to_the_speed_of_a_rotor_orders(tmp_path: Path) -> None:
-    rig = as_law(rig_of_preset(ambid.preset("central-mass")))
-    assert rig.loop is not None
-    assert rig.loop.law is not None
-    first, second = rig.loop.law, rig.loop.law.scaled([1.1] * rig.loop.law.D.shape[1])
-    loop = Loop(delay=rig.loop.delay, law=first, laws=((0.0, first), (300.0, second)))
-    (tmp_path / "rig.toml").write_text(rig_text(replace(rig, loop=loop), tmp_path))
-    back = load_rig(tmp_path / "rig.toml")
-    assert back.loop is not None
-    assert [speed for speed, _ in back.loop.laws] == [0.0, 300.0]
-    assert isinstance(back.plant, RotorModel)
-    for speed, law in ((0.0, first), (140.0, first), (160.0, second), (400.0, second)):
-        found = law_on(back.loop, back.plant.at_speed(speed), first.rate_hz)
-        assert found is not None
-        np.testing.assert_array_equal(found.D, law.D)
-    with pytest.raises(ModelError, match="the first of its laws"):
-        Loop(law=second, laws=loop.laws)

@@ -479,7 +479,6 @@ def loop_entry(loop: Loop) -> dict[str, object]:
             "kind": "state-space",
             "rate_hz": loop.law.rate_hz,
             **{n: getattr(loop.law, n).tolist() for n in "ABCDG"},
-            **({"laws": [speed for speed, _ in loop.laws]} if loop.laws else {}),
         }
     cutoff = loop.derivative_cutoff_hz if math.isfinite(loop.derivative_cutoff_hz) else None
     gains = {name: getattr(loop, name) for name in ("kp", "ki", "kd", "kc")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,14 +34,10 @@ class Loop:
     # delay between the logged voltage and the coil in samples; fractions allowed. It acts in open loop too.
     delay: float = 0.0
     law: StateLaw | None = None  # in place of the gains, which are then zero
-    # of a rotor: speeds in rad/s and laws, of which the nearest orders; `law` is the first
-    laws: tuple[tuple[float, StateLaw], ...] = ()
 
     def __post_init__(self) -> None:
         if self.law is not None and any((self.kp, self.ki, self.kd, self.kc)):
             raise ModelError("the loop has gains and a state-space law; one of them orders. Give the one or the other")
-        if self.laws and (self.law is not self.laws[0][1] or not all(speed >= 0.0 for speed, _ in self.laws)):
-            raise ModelError("a loop's law is the first of its laws over speed, and no speed is negative. Correct them")
         for name in ("kp", "ki", "kd", "kc"):
             if not math.isfinite(getattr(self, name)):
                 raise ModelError(f"loop.{name} is {getattr(self, name)}; a gain must be a finite number. Correct it")
@@ -67,15 +63,9 @@ class Loop:
         """Return the loop that sees position and current multiplied by these factors."""
         if self.law is not None:
             each = [position, current] if self.law.D.shape[1] > self.law.D.shape[0] else [position]
-            return self.with_laws(lambda law: law.scaled(each * law.D.shape[0]))
+            return replace(self, law=self.law.scaled(each * self.law.D.shape[0]))
         p = position
         return replace(self, kp=p * self.kp, ki=p * self.ki, kd=p * self.kd, kc=current * self.kc)
-
-    def with_laws(self, change: Callable[[StateLaw], StateLaw]) -> Loop:
-        """Return the loop with its law, or all of them, changed."""
-        assert self.law is not None
-        laws = tuple((speed, change(law)) for speed, law in self.laws)
-        return replace(self, law=laws[0][1] if laws else change(self.law), laws=laws)
 
     @property
     def pull(self) -> float:

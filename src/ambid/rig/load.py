@@ -30,7 +30,7 @@ from ambid.rig.rig import (
     optional_roles,
     role_units,
 )
-from ambid.rig.rotor import modes_of, operation_of, planes_of, rotor_of, shaft_of, si_of, speed_of, turning_of, unit_of
+from ambid.rig.rotor import modes_of, operation_of, planes_of, rotor_of, shaft_of, si_of, turning_of, unit_of
 from ambid.settings.caller import command, path_of
 from ambid.units import UNKNOWN, parse_unit
 
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from ambid.rig.schema import (
         ChannelEntry,
         DaqEntry,
-        LawEntry,
         LimitsEntry,
         LoopEntry,
         MagnetEntry,
@@ -302,7 +301,7 @@ def _loop(entry: LoopEntry, where: str) -> Loop:
     gains = {name: getattr(entry, name) for name in ("kp", "ki", "kd", "kc", "derivative_cutoff_hz")}
     matrices = {name: getattr(entry, name) for name in (*"ABCD", "rate_hz")}
     if entry.kind == "pid":
-        keys = [name for name, x in {**matrices, "G": entry.G, "laws": entry.laws or None}.items() if x is not None]
+        keys = [name for name, x in {**matrices, "G": entry.G}.items() if x is not None]
         if keys:
             raise RigError(
                 f'{where}: loop.{keys[0]} is of a state-space law, and loop.kind is "pid". Omit it, or give kind = '
@@ -316,15 +315,9 @@ def _loop(entry: LoopEntry, where: str) -> Loop:
         what = f"has no loop.{missing[0]}" if missing else f"has loop.{extra[0]}, which is of a PID"
         raise RigError(f'{where}: [loop] of kind "state-space" {what}. Give A, B, C, D and rate_hz alone')
     try:
-        law, rate = _law(entry, matrices["rate_hz"]), matrices["rate_hz"]
-        more = [(speed_of(x.speed, f"{where}: loop.laws[{k}]"), _law(x, rate)) for k, x in enumerate(entry.laws)]
-        return Loop(delay=entry.delay, law=law, laws=((0.0, law), *more) if more else ())
+        return Loop(delay=entry.delay, law=StateLaw(**{**matrices, "G": entry.G}))
     except ModelError as failure:
         raise RigError(f"{where}: {failure}") from None
-
-
-def _law(entry: LoopEntry | LawEntry, rate_hz: float) -> StateLaw:
-    return StateLaw(**{name: getattr(entry, name) for name in "ABCDG"}, rate_hz=rate_hz)
 
 
 def _limits(entry: LimitsEntry, where: str) -> Limits:

@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import Literal
 
 from ambid.errors import RigError, choices
-from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.presets import Turning
@@ -614,14 +613,10 @@ def _magnet_lines(magnet: RigMagnet) -> list[str]:
     return [*lines, "[magnet.parameters]", *_parameter_lines(magnet.parameters)] if magnet.parameters else lines
 
 
-def _law_entries(law: StateLaw) -> dict[str, object]:
-    return {name: getattr(law, name).tolist() for name in "ABCDG"}
-
-
 def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:
     law: dict[str, object] = {name: getattr(loop, name) for name in ("kp", "ki", "kd", "kc")}
     if loop.law is not None:
-        law = {"rate_hz": loop.law.rate_hz, **_law_entries(loop.law)}
+        law = {"rate_hz": loop.law.rate_hz, **{name: getattr(loop.law, name).tolist() for name in "ABCDG"}}
     intervals = {}
     for role in ("voltage", "current", "position") if limits is not None else ():
         low, high = getattr(limits, role)
@@ -635,7 +630,4 @@ def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:
         "derivative_cutoff_hz": loop.derivative_cutoff_hz if math.isfinite(loop.derivative_cutoff_hz) else None,
         "delay": loop.delay, "limits": intervals or None,
     }  # fmt: skip
-    lines = ["[loop]", *toml_lines(entries)]
-    for speed, other in loop.laws[1:]:
-        lines += ["", "[[loop.laws]]", *toml_lines({"speed": _quantity(speed, "rad/s"), **_law_entries(other)})]
-    return lines
+    return ["[loop]", *toml_lines(entries)]

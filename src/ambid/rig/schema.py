@@ -92,17 +92,6 @@ class LimitsEntry(_Entry):
     position: Interval | None = None
 
 
-class LawEntry(_Entry):
-    """``[[loop.laws]]``: the law of a rotor at one more speed."""
-
-    speed: QuantityEntry
-    A: Matrix
-    B: Matrix
-    C: Matrix
-    D: Matrix
-    G: Matrix | None = None
-
-
 class LoopEntry(_Entry):
     """``[loop]``: the controller, for simulation; see :class:`ambid.physics.loop.Loop` for its law and units."""
 
@@ -120,7 +109,6 @@ class LoopEntry(_Entry):
     C: Matrix | None = None
     D: Matrix | None = None
     G: Matrix | None = None
-    laws: tuple[LawEntry, ...] = ()
 
 
 class ResolutionsEntry(_Entry):

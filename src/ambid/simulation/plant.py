@@ -178,14 +178,10 @@ def signals_fed_back(of: LinearModel) -> NDArray[np.int64]:
 
 
 def law_on(loop: Loop, of: LinearModel, rate_hz: float) -> StateLaw | None:
-    """Return the state-space law of a loop, if it has one, at the rotor's speed; refuse another plant or rate."""
-    law = loop.law
-    if law is not None:
-        if loop.laws:
-            speed = abs(float(getattr(of, "speed", 0.0)))
-            law = min(loop.laws, key=lambda x: abs(x[0] - speed))[1]
-        law.check(len(of.inputs), signals_fed_back(of).size, rate_hz)
-    return law
+    """Return the state-space law of a loop, if it has one; refuse another plant or rate."""
+    if loop.law is not None:
+        loop.law.check(len(of.inputs), signals_fed_back(of).size, rate_hz)
+    return loop.law
 
 
 def matrices_of(law: StateLaw | None) -> tuple[Array, Array, Array, Array, Array]:
