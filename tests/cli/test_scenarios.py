@@ -1,6 +1,5 @@
 """``ambid simulate --scenario``: the record, its truth, and what is refused."""
 
-import gzip
 from dataclasses import replace
 
 import numpy as np
@@ -70,18 +69,6 @@ def test_a_spin_up_logs_speed_and_angle_and_the_excitation_on_request(here, ambi
     assert record.channel("true_unbalance").unit == "kg m"
 
 
-@pytest.mark.parametrize("out", ["r.csv", "r.csv.gz"])
-def test_lost_samples_are_counted_and_missing(here, ambid, out):
-    found = simulated(ambid, "dropped:0.05", *SHORT, out=out)
-    assert found.code == 0
-    assert "of them lost or without a value" in found.out
-    data = (here / out).read_bytes()
-    text = (gzip.decompress(data) if out.endswith("gz") else data).decode()
-    assert ",," in text
-    assert read_record(here / out, gaps="interpolate").n_samples == 2000
-    assert ambid("identify", out).code == 2
-
-
 def test_limits_that_are_met_are_told(here, ambid):
     found = simulated(ambid, "saturation", *SHORT)
     assert found.code == 0
@@ -129,7 +116,3 @@ def test_what_does_not_fit_is_refused_on_one_line(here, ambid, case):
     assert said in found.err
     assert len(found.err.splitlines()) == 1
     assert not list(here.iterdir())
-
-
-def test_lost_samples_want_a_text_file(here, ambid):
-    assert ".csv.gz" in simulated(ambid, "dropped", out="r.h5").err

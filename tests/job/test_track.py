@@ -158,13 +158,12 @@ def test_a_damaged_file_ends_at_the_same_estimate_and_says_what_was_left_out(tmp
 
 
 def test_lost_samples_all_over(tmp_path):
-    from ambid.simulation.scenarios import losses
-
     record = simulated(seconds=3.0, seed=2)
     lines = rows(record)
+    rng = np.random.default_rng(4)
     gone = []
-    for x in losses(len(lines), 0.01, 4, first=round(1.2 * RATE)):
-        for k in range(x.first, x.stop):
+    for first in range(round(1.2 * RATE), len(lines) - 800, 800):  # one burst in 800 samples, about 8 long
+        for k in range(first, first + int(rng.geometric(1 / 8))):
             lines[k] = lines[k].split(",")[0] + ",,,"
             gone.append(k)
     found = track(written(tmp_path / "r.csv", lines))

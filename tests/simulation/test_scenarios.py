@@ -42,7 +42,7 @@ def test_every_scenario_leaves_the_rotor_levitated(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "truth"),
     [
-        ("steady", {}), ("quiet", {}), ("dropped", {}), ("saturation", {}),
+        ("steady", {}), ("quiet", {}), ("saturation", {}),
         ("change", {"k_i": (55.73352, 0.85 * 55.73352, "N/A")}), ("added-mass", {"m": (4.0, 4.4, "kg")}),
         ("sensor-gain", {"gain_position": (1.0, 0.8, "1")}), ("offset", {"force": (0.0, 5.573352, "N")}),
         ("spin-up", {"unbalance": (6.3662e-6, 6.3662e-6, "kg m"), "unbalance_phase": (0.6, 0.6, "rad")}),
@@ -206,7 +206,6 @@ def test_bad_requests_are_refused(rig: Rig) -> None:
         ("change", {"rate_hz": 0.0}, "rate_hz"),
         ("steady", {"size": 1.0}, "no size"),
         ("quiet", {"amplitude": 1.0}, "no excitation"),
-        ("dropped", {"size": 0.9}, "share"),
         ("added-mass", {"size": -1.0}, "must stay positive"),
     ):
         with pytest.raises(ModelError, match=said):

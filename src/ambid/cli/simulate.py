@@ -66,47 +66,29 @@ def _recipe(rig: str, what: str, seed: int) -> str:
 
 
 def _run_scenario(v: Values, preset: Preset | None) -> None:
-    """Simulate a scenario, write the record and say what is in it.
-
-    A scenario that loses samples is written as CSV.
-    """
+    """Simulate a scenario, write the record and say what is in it."""
     from ambid.record import write_record
     from ambid.rig import load_rig
     from ambid.rig.draft import as_logged
     from ambid.simulation import simulate_scenario
-    from ambid.simulation.scenarios import damage, scenario
 
     name, size_asked, at_s = _named(v.scenario)
-    what, record = scenario(name), v.out
     how = v.only("rate_hz amplitude closed log_excitation force")
     how |= {"duration_s": v.duration, "at_s": at_s, "size": size_asked}
     with Outputs(None if preset else Path(v.rig)) as outputs, progress("simulate"):
-        outputs.claim(record, "out", _ENDINGS[:2] if what.dropped else _ENDINGS, force=v.force)
-        done = simulate_scenario(what, as_logged(preset) if preset else load_rig(Path(v.rig)), seed=v.seed, **how)
+        outputs.claim(v.out, "out", _ENDINGS, force=v.force)
+        done = simulate_scenario(name, as_logged(preset) if preset else load_rig(Path(v.rig)), seed=v.seed, **how)
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
-        lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")
+        lines = (f"truth: {truth_words(done)}", f"scenario {name}: {_words(done, told)}")
         size = f" of {told['size']:.6g} ({told['size_is']})" if "size" in told else ""
         made = _recipe(v.rig, f"scenario {told['name']}{size}, excitation of {told['amplitude']:.6g} V", v.seed)
-        comments = () if record.suffix in (".h5", ".hdf5") else (made, *lines)
-        lost = 0
-
-        def write(path: Path) -> None:
-            nonlocal lost
-            if not what.dropped:
-                write_record(done.record, path)
-                return
-            first = round(told["from_s"] * done.record.rate_hz)
-            share = told["size"]
-            found = damage(done.record, path, share=share, seed=v.seed, first=first)
-            lost = sum(x.stop - x.first for x in found)
-
-        outputs.stage(record, write)
-        outputs.stage_notes(record, comments)
+        comments = () if v.out.suffix in (".h5", ".hdf5") else (made, *lines)
+        outputs.stage(v.out, lambda path: write_record(done.record, path))
+        outputs.stage_notes(v.out, comments)
     warn(done)
     n, rate = done.record.n_samples, done.record.rate_hz
-    short = f", {lost} of them lost or without a value" if lost else ""
     what_moves = f"excitation of {told['amplitude']:.4g} V, seed {v.seed}"
-    typer.echo(f"{record}: {counted(n, 'sample')} at {rate:g} Hz{short}, {what_moves}")
+    typer.echo(f"{v.out}: {counted(n, 'sample')} at {rate:g} Hz, {what_moves}")
     for line in lines:
         typer.echo(line)
 

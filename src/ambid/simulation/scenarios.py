@@ -4,98 +4,22 @@ gain g, z = g x, has the same equations with m/g^2, k_x/g^2, c/g^2, k_i/g: witho
 
 from __future__ import annotations
 
-import gzip
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import ModelError, RecordError, choices
+from ambid.errors import ModelError, choices
 from ambid.physics.presets import Preset
-from ambid.record import write_record
-from ambid.record.csv_format import notes_path, notes_text
 from ambid.record.record import Channel, Record, Step
 from ambid.signals import multisine
 from ambid.simulation.bench import TRUE, Simulation, VaryingLoop, join
 from ambid.simulation.rig_bench import Bench, as_columns
 from ambid.simulation.variation import Schedule, Unbalance, Variation
-
-_MEAN_BURST = 8  # samples
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Loss:
-    """One burst of lost samples, `first` to `stop` - 1: one channel's cells are empty; all but the time are; or the
-    rows are missing, so that time jumps.
-    """
-
-    first: int
-    stop: int
-    kind: str  # ``"cells"``, ``"rows"`` or ``"skipped"``
-    column: int  # which channel, for ``"cells"``; any number, to be taken modulo the number of channels
-
-
-_KINDS = ("cells", "rows", "skipped")
-
-
-def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[Loss, ...]:
-    """Return which samples are lost, `share` (over 0, to 0.5) of those from `first` on but the record's first and last
-    eight: bursts of all kinds in turn, apart from each other.
-    """
-    begin, end = max(first, 8), n_samples - 8
-    if not 0.0 < share <= 0.5:
-        raise RecordError(f"the share of lost samples is {share}; it must be above 0 and at most 0.5. Correct it")
-    if end - begin < 64:
-        raise RecordError(
-            f"{max(0, end - begin)} samples can be lost from sample {first} on; losses need 64. Record for longer"
-        )
-    rng = np.random.default_rng([seed, 0x1055])
-    count = max(3, round(share * (end - begin) / _MEAN_BURST))
-    cell = (end - begin) / count
-    lengths = np.minimum(rng.geometric(1.0 / _MEAN_BURST, count), int(cell) - 2)
-    starts = begin + np.floor(np.arange(count) * cell + rng.random(count) * (cell - lengths - 2)).astype(np.int64)
-    columns = rng.integers(0, 1000, count)
-    return tuple(
-        Loss(first=int(a), stop=int(a + n), kind=_KINDS[j % 3], column=int(columns[j]))
-        for j, (a, n) in enumerate(zip(starts, lengths, strict=True))
-    )
-
-
-def damage(
-    record: Record, path: str | Path, *, share: float, seed: int, first: int = 0, comments: Sequence[str] = ()
-) -> tuple[Loss, ...]:
-    """Write a record as a CSV file in which samples are lost, and return which (`losses`); ``true_`` channels lose no
-    cells.
-    """
-    path = Path(path)
-    if not path.name.lower().endswith((".csv", ".csv.gz")):
-        raise RecordError(f"{path}: lost samples can be written as CSV only. Write .csv or .csv.gz")
-    lost = losses(record.n_samples, share, seed, first=first)
-    write_record(record, path)
-    packed = path.suffix.lower() == ".gz"
-    data = path.read_bytes()
-    lines = (gzip.decompress(data) if packed else data).decode().split("\n")
-    top = next(k for k, line in enumerate(lines) if not line.startswith("#")) + 1
-    measured = [j + 1 for j, c in enumerate(record.channels) if not c.name.startswith("true_")]
-    for loss in lost:
-        empty = [measured[loss.column % len(measured)]] if loss.kind == "cells" else measured
-        for k in range(loss.first + top, loss.stop + top):
-            cells = lines[k].split(",")
-            for j in empty:
-                cells[j] = ""
-            lines[k] = "" if loss.kind == "skipped" else ",".join(cells)
-    text = "\n".join(line for line in lines if line) + "\n"
-    data = gzip.compress(text.encode(), compresslevel=6, mtime=0) if packed else text.encode()
-    path.write_bytes(data)
-    if comments:
-        notes_path(path).write_text(notes_text(path.name, data, comments), encoding="utf-8")
-    return lost
-
 
 _PERIOD = 20_000  # samples in which the excitation repeats
 _FLATTEN = 40  # iterations that lower the peaks of an excitation
@@ -162,7 +86,6 @@ class Scenario:
     excited: bool = True  # whether the bench is excited persistently
     # whether a second, larger excitation is added from the beginning on: its peak is `size` times the voltage's room
     driven: bool = False
-    dropped: bool = False  # whether samples are lost; `size` is their share
 
     def size_for(self, bench: Bench, requested: float | None) -> float:
         """Return how much happens, in the unit of `size_is`: what was `requested`, else its own or the bench's."""
@@ -173,11 +96,7 @@ class Scenario:
                 f"the size of scenario {self.name!r} is {requested}; it must be finite. Give {self.size_is}"
             )
         size = self.size if requested is None else requested
-        if size is None:
-            size = self.own_size(bench) if self.own_size else 0.0
-        if self.dropped and not 0.0 < size <= 0.5:
-            raise ModelError(f"the size of scenario {self.name!r} is {size}; it is a share above 0 and at most 0.5")
-        return size
+        return size if size is not None else self.own_size(bench) if self.own_size else 0.0
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -275,11 +194,6 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 duration_s=4.0, size=1.5, size_is="its peak over the available voltage", driven=True,
             ),
             Scenario(
-                name="dropped",
-                summary="samples are lost: empty cells, empty rows, missing rows",
-                duration_s=4.0, begins=0.1, size=0.01, size_is="share of lost samples", dropped=True,
-            ),
-            Scenario(
                 name="offset",
                 summary="a constant load of a tenth of what the current limit can hold",
                 duration_s=4.0, size_is="force in N", own_size=_load_of,
@@ -335,8 +249,7 @@ def simulate_scenario(
     Simulation
         Its record (a rig's has the rig's columns, uncalibrated) has a column ``true_<name>`` for all that varies,
         e.g. ``true_k_i``, ``true_gain_position``, ``true_force``, ``true_unbalance`` and ``true_unbalance_phase``, and
-        ``speed`` and ``angle`` where the rotor turns; `Simulation.truth` are the parameters at the beginning. That of
-        ``dropped`` is whole: `ambid.simulation.damage` writes the damaged file.
+        ``speed`` and ``angle`` where the rotor turns; `Simulation.truth` are the parameters at the beginning.
 
     Raises
     ------
