@@ -70,7 +70,7 @@ def test_a_spin_up_logs_speed_and_angle_and_the_excitation_on_request(here, ambi
 
 
 def test_limits_that_are_met_are_told(here, ambid):
-    found = simulated(ambid, "saturation", *SHORT)
+    found = simulated(ambid, "steady", "--duration", "0.1", "--amplitude", "100")
     assert found.code == 0
     assert "the command was limited" in found.err
 

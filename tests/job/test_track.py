@@ -14,7 +14,8 @@ from ambid.job import identify, track
 from ambid.physics.presets import preset
 from ambid.record import Record, write_record
 from ambid.rig import default_rig
-from ambid.simulation import simulate_scenario, truth_columns
+from ambid.signals import multisine
+from ambid.simulation import simulate_preset, simulate_scenario, truth_columns
 from tests.tracking.runs import RATE, START_S, TRUE, simulated, start, step
 
 BENCH = preset("unstable-bearing")
@@ -52,9 +53,17 @@ def test_a_scenario_is_told_as_it_was(name, moved):
     assert found.lines[-1].state == "tracking"
 
 
-@pytest.mark.parametrize("name", ["steady", "saturation"])
-def test_nothing_is_told_where_nothing_changes(name):
-    record, truth = scenario(name, 2.5)
+@pytest.mark.parametrize("pushed", [False, True])
+def test_nothing_is_told_where_nothing_changes(pushed):
+    record, truth = scenario("steady", 2.5)
+    if pushed:  # a fast excitation that meets the limits of the voltage, from half of the time on
+        u = simulate_scenario("steady", BENCH, duration_s=2.5, seed=2, log_excitation=True).record["excitation"].copy()
+        low, high = BENCH.limits.voltage
+        fast = multisine(20_000, RATE, amplitude=0.75 * (high - low), band=(RATE / 40, RATE / 5), seed=3)
+        u[25_000:] += np.resize(fast, 25_000)
+        done = simulate_preset(BENCH, u, seed=2)
+        assert done.n_saturated > 0
+        record = done.record
     found = track(record)
     assert kinds(found) == []
     assert found.totals.update_s == 0.0

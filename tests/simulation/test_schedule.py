@@ -31,13 +31,6 @@ def test_jumps_inside_lines_keep_both_sides() -> None:
     assert at(Schedule(times_s=(1.0, 1.0, 2.0), values=(7.0, 0.0, 1.0)), 0.5, 1.0, 1.5) == [7.0, 0.0, 0.5]
 
 
-def test_a_warm_up_follows_the_exponential() -> None:
-    s = Schedule.warm_up(1.6, 1.92, 2.0, 20.0)
-    t = np.linspace(0.0, 150.0, 3001)
-    wanted = 1.6 - 0.32 * np.expm1(-np.clip(t - 2.0, 0.0, None) / 20.0)
-    assert s.at(t * RATE, RATE) == pytest.approx(wanted, abs=6e-5 * 0.32)
-
-
 def test_many_samples_give_what_each_gives_alone() -> None:
     s = Schedule(times_s=(0.1, 0.2, 0.2, 0.7), values=(1.0, 4.0, 2.0, -1.0))
     k = np.arange(0.0, 1000.0, 0.5)
@@ -62,5 +55,3 @@ def test_the_integral_is_exact() -> None:
 def test_bad_knots_are_refused(times: tuple[float, ...], values: tuple[float, ...], said: str) -> None:
     with pytest.raises(ModelError, match=said):
         Schedule(times_s=times, values=values)
-    with pytest.raises(ModelError, match="time constant"):
-        Schedule.warm_up(1.0, 2.0, 0.0, 0.0)

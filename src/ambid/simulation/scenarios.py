@@ -26,20 +26,12 @@ _FLATTEN = 40  # iterations that lower the peaks of an excitation
 _FRACTION = 0.4  # of the limits that an amplitude chosen here uses: a bench that changes needs room
 
 
-def input_room(bench: Bench) -> float:
-    """From the operating point to the nearer limit of the input; infinite where it has none."""
-    name = bench.linear.model.inputs[0]
-    rest = float(getattr(bench.point, name))
-    low, high = getattr(bench.limits, name)
-    return float(min(abs(low - rest), abs(high - rest)))
-
-
-def one_period(bench: Bench, seed: int, *, fast: bool = False) -> Array:
+def one_period(bench: Bench, seed: int) -> Array:
     """Return one period (n_samples,) of a multisine of peak one from 1/4000 to 1/20 of the rate, where rotor and coil
-    both answer; a `fast` one, from 1/40 to 1/5, the rotor hardly follows.
+    both answer.
     """
     rate = bench.rate_hz
-    band = (rate / 40.0, rate / 5.0) if fast else (rate / 4000.0, rate / 20.0)
+    band = (rate / 4000.0, rate / 20.0)
     return multisine(_PERIOD, rate, amplitude=1.0, band=band, seed=seed, crest_iterations=_FLATTEN)
 
 
@@ -54,9 +46,6 @@ def amplitude_for(bench: Bench, shape: Array, seed: int) -> float:
 
 DRIFT_S = 60.0
 """Time in s over which the drift is complete."""
-
-WARM_UP_S = 20.0
-"""Time constant of the warm-up in s."""
 
 TOP_SPEED = 15_000 * math.pi / 30
 """Speed in rad/s to which the spin-up goes."""
@@ -84,8 +73,6 @@ class Scenario:
     vary: Callable[[Bench, float, float, float], Variation] = lambda *_: Variation()
     own_size: Callable[[Bench], float] | None = None  # the size where `size` is None
     excited: bool = True  # whether the bench is excited persistently
-    # whether a second, larger excitation is added from the beginning on: its peak is `size` times the voltage's room
-    driven: bool = False
 
     def size_for(self, bench: Bench, requested: float | None) -> float:
         """Return how much happens, in the unit of `size_is`: what was `requested`, else its own or the bench's."""
@@ -160,12 +147,6 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 vary=_changing("R", lambda before, after, at: Schedule.ramp(before, after, at, at + DRIFT_S)),
             ),
             Scenario(
-                name="warm-up",
-                summary="the coil warms exponentially: R +20 %, time constant 20 s",
-                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R in the end",
-                vary=_changing("R", lambda before, after, at: Schedule.warm_up(before, after, at, WARM_UP_S)),
-            ),
-            Scenario(
                 name="change",
                 summary="k_i drops by 15 %, in the force and in the back-EMF",
                 duration_s=4.0, size=-0.15, size_is=f"{_PART} of k_i", vary=_changing("k_i"),
@@ -187,11 +168,6 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 summary="the rotor spins up to 15 000 rpm with unbalance (G 2.5 there)",
                 duration_s=20.0, begins=0.05, size_is="unbalance in kg m", vary=_spin_up,
                 own_size=lambda bench: _parameter(bench, "m") * GRADE / TOP_SPEED,
-            ),
-            Scenario(
-                name="saturation",
-                summary="a fast excitation that reaches the voltage limits",
-                duration_s=4.0, size=1.5, size_is="its peak over the available voltage", driven=True,
             ),
             Scenario(
                 name="offset",
@@ -342,36 +318,19 @@ class _Run:
         if amplitude and not self.scenario.excited:
             raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Omit the amplitude")
         self.size = self.scenario.size_for(b, size)
-        self.amplitude, self._period, self._extra = 0.0, np.zeros(1), np.zeros(1)
+        self.amplitude, self._period = 0.0, np.zeros(1)
         if self.scenario.excited:
             shape = one_period(b, self.seed)
             self.amplitude = amplitude_for(b, shape, self.seed) if amplitude is None else amplitude
             self._period = self.amplitude * shape
-        if self.scenario.driven:
-            room = input_room(b)
-            if not math.isfinite(room):
-                raise ModelError(
-                    f"bench {b.name!r} does not limit its {b.linear.model.inputs[0]}; nothing can saturate. Set"
-                    " loop.limits, or choose another scenario"
-                )
-            self._extra = self.size * room * one_period(b, self.seed + 1, fast=True)
         self.running = VaryingLoop(
             b.plant, self.scenario.vary(b, self.at_s, self.size, self.duration_s), rate_hz=b.rate_hz, seed=seed,
             loop=b.loop, limits=b.limits, noise=b.noise, operating_point=b.point,
         )  # fmt: skip
 
-    @property
-    def first_sample(self) -> int:
-        """The sample at which it begins."""
-        return round(self.at_s * self.bench.rate_hz)
-
     def excitation(self, first: int, n: int) -> Array:
         """Return the excitation of n samples."""
-        k = first + np.arange(n)
-        u = self._period[k % self._period.size]
-        if self.scenario.driven:
-            u += np.where(k >= self.first_sample, self._extra[k % self._extra.size], 0.0)
-        return u
+        return np.asarray(self._period[(first + np.arange(n)) % self._period.size])
 
     def settings(self) -> dict[str, object]:
         """Return what the history says."""

@@ -19,8 +19,6 @@ from ambid.errors import ModelError, choices
 from ambid.physics.linear_model import LinearModel, discretise
 from ambid.simulation.plant import Equations
 
-_PER_TIME_CONSTANT = 50  # corners of a warm-up: the lines leave the exponential by 5e-5 of its rise at most
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schedule:
@@ -83,33 +81,6 @@ class Schedule:
         Schedule, with two knots
         """
         return cls(times_s=(from_s, to_s), values=(before, after))
-
-    @classmethod
-    def warm_up(cls, before: float, after: float, from_s: float, time_constant_s: float) -> Self:
-        """Return before + (after - before) (1 - exp(-(t - from)/tau)), as a body heats up.
-
-        Parameters
-        ----------
-        before, after : float
-            Value until `from_s`, and where it goes.
-        from_s, time_constant_s : float
-            In s.
-
-        Returns
-        -------
-        Schedule
-            Lines between 50 points of the exponential in each time constant, for ten of them.
-
-        Raises
-        ------
-        ModelError
-            If the time constant is not positive.
-        """
-        if not time_constant_s > 0.0:
-            raise ModelError(f"the time constant of a warm-up is {time_constant_s} s; it must be positive. Correct it")
-        t = np.arange(10 * _PER_TIME_CONSTANT + 1) / _PER_TIME_CONSTANT
-        values = before + (after - before) * -np.expm1(-t)
-        return cls(times_s=tuple((from_s + time_constant_s * t).tolist()), values=tuple(values.tolist()))
 
     def knots(self, rate_hz: float) -> Array:
         """Return the knots in whole samples at `rate_hz` in Hz, shape (n_knots,)."""
