@@ -1,25 +1,18 @@
 """Alarms over years: found with cause and date, none without a fault, none from what is not usable; rules; telling."""
 
-import json
-import socket
-import subprocess
-import time
 from dataclasses import replace
-from pathlib import Path
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 import ambid
 from ambid.errors import AmbidError
-from ambid.ledger import RecordRule, Rule, open_ledger, publish, read_rules, watch, write_metrics
+from ambid.ledger import RecordRule, Rule, open_ledger, read_rules, watch, write_metrics
 from tests.ledger.entries import BEGIN, DAY, entry, parameter
 from tests.ledger.simulated import BEGIN as START
 from tests.ledger.simulated import MONTH_S, YEARS, bearing, fleet, judge
 
 END = START + YEARS * 12 * MONTH_S
-MOSQUITTO = Path("/usr/sbin/mosquitto")
 
 
 @pytest.fixture(scope="module")
@@ -177,43 +170,3 @@ def test_metrics_are_those_of_prometheus(watched, tmp_path):
     found = {f.name: f.samples for f in families}
     assert len(found["ambid_parameter"]) == 5 * len(watched.bearings)
     assert sum(x.value for x in found["ambid_alarm"]) == len(watched.open)
-
-
-def test_what_is_published_is_a_message_for_each_bearing(watched, monkeypatch):
-    client, broker = pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed"), MagicMock()
-    broker.connect.side_effect = lambda *_: broker.on_connect(0, 0, 0, MagicMock(is_failure=False))
-    monkeypatch.setattr(client, "Client", lambda *_, **__: broker)
-    assert publish(watched, "localhost/works") == len(watched.bearings)
-    assert [json.loads(call.args[1])["bearing"] for call in broker.publish.call_args_list] == list(watched.bearings)
-
-
-@pytest.mark.skipif(not MOSQUITTO.exists(), reason="Debian's package mosquitto, a broker, is not installed")
-def test_a_broker_gets_a_message_for_each_bearing(watched, monkeypatch):
-    subscribe = pytest.importorskip("paho.mqtt.subscribe", reason="paho-mqtt is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    broker = subprocess.Popen([MOSQUITTO, "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        end = time.monotonic() + 20.0
-        while time.monotonic() < end:
-            try:
-                socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
-                break
-            except OSError:
-                time.sleep(0.05)
-        assert publish(watched, f"127.0.0.1:{port}/works") == len(watched.bearings)
-        name = watched.standing[0].bearing
-        message = subscribe.simple(f"works/{name}", hostname="127.0.0.1", port=port)
-        assert f'"bearing": "{name}"'.encode() in message.payload
-        assert b'"rule"' in message.payload
-    finally:
-        broker.terminate()
-        broker.wait()
-    with pytest.raises(AmbidError, match="Check broker"):
-        publish(watched, f"127.0.0.1:{port}/works")
-    with pytest.raises(AmbidError, match="must be HOST"):
-        publish(watched, "localhost")
-    with pytest.raises(AmbidError, match="takes no user or password") as refused:
-        publish(watched, "me:secret@127.0.0.1/works")
-    assert "secret" not in str(refused.value)

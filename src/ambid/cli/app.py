@@ -63,7 +63,10 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "console": dict.fromkeys(("key", "certificate", "listen"), "'ssh -L', which forwards the port"),
     "export": {"to": "--library"},
     "init": {"plot": "'ambid info RECORD --plot FILE.png'"},
-    "history": {"export": "", "tables": "", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
+    "history": {
+        "export": "", "tables": "", "metrics": "--publish FILE.prom",
+        "mqtt": "--json -, which any client of a broker passes on",
+    },
     "design controller": {"method": "--kind", "export": "--law", "judges": "", "schedule": ""},
     "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},

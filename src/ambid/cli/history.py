@@ -11,7 +11,7 @@ import typer
 from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter
-from ambid.errors import AmbidError, counted
+from ambid.errors import AmbidError
 from ambid.estimation.result import Result
 from ambid.job.files import METRICS_ENDINGS
 from ambid.settings.caller import command as command_of
@@ -68,15 +68,13 @@ def command(v: Values) -> None:
     from ambid.ledger.entry import moment
     from ambid.ledger.rules import BUILT_IN
     from ambid.ledger.silences import silences, take_note
-    from ambid.ledger.telling import publish, write_metrics
+    from ambid.ledger.telling import write_metrics
     from ambid.report.history import bearings_text
 
     place = None if "://" in v.ledger else Path(v.ledger)
     file = None if v.alarms in (None, _USUAL) else Path(str(v.alarms))
     with Outputs(place, file, **v.outputs) as outputs:
-        gauges = [Path(x) for x in v.publish or () if x.endswith(METRICS_ENDINGS)]
-        for path in gauges:
-            outputs.claim(path, "publish", METRICS_ENDINGS)
+        outputs.claim(v.publish, "publish", METRICS_ENDINGS)
         rules = BUILT_IN if file is None else read_rules(file)
         if v.alarms is None:
             refuse_given(v.only("publish acknowledge"), "{} needs --alarms. Give it, or omit {}")
@@ -110,10 +108,8 @@ def command(v: Values) -> None:
                     typer.echo(f"{', '.join(a.rule for a in own)}: noted in {found.shown}", err=True)
                     watched = look()
                 result = watched
-                for path in gauges:
-                    outputs.stage(path, lambda beside: write_metrics(watched, beside))
-                for broker in (x for x in v.publish or () if not x.endswith(METRICS_ENDINGS)):
-                    typer.echo(f"{counted(publish(watched, broker), 'message')} sent to {broker}", err=True)
+                if v.publish is not None:
+                    outputs.stage(v.publish, lambda beside: write_metrics(watched, beside))
             elif v.bearing is None:
                 known = found.bearings(), found.failures().values(), found.corrections()
                 typer.echo(bearings_text(*known, paint=painter()))

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ambid.ledger.store import FleetRun as FleetRun
     from ambid.ledger.store import Ledger as Ledger
     from ambid.ledger.store import open_ledger as open_ledger
-    from ambid.ledger.telling import publish as publish
     from ambid.ledger.telling import write_metrics as write_metrics
     from ambid.ledger.trends import Trend as Trend
 

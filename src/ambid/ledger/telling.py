@@ -1,24 +1,17 @@
-"""What is watched, told to other programs: metrics for Prometheus, messages over MQTT."""
+"""What is watched, told to other programs: metrics for Prometheus."""
 
 from __future__ import annotations
 
-import json
-import os
-from dataclasses import asdict
 from pathlib import Path
-from queue import Empty, Queue
 from typing import Any
 
 import numpy as np
 
-from ambid.errors import AmbidError, counted, needs
-from ambid.estimation.estimate import plain_json
+from ambid.errors import needs
 from ambid.ledger.alarm import KINDS
 from ambid.ledger.history import History
-from ambid.ledger.monitor import Now, Watched
+from ambid.ledger.monitor import Watched
 from ambid.settings.caller import setting
-
-PATIENCE_S = 10.0  # for which a broker may stay silent
 
 
 def write_metrics(watched: Watched, path: str | Path) -> None:
@@ -82,84 +75,6 @@ def write_metrics(watched: Watched, path: str | Path) -> None:
     Path(path).write_bytes(generate_latest(registry))
 
 
-def publish(watched: Watched, where: str) -> int:
-    """Send a retained message for each bearing to a broker of MQTT; needs the extra ``ambid[mqtt]``.
-
-    User and password are taken from ``AMBID_MQTT_USER`` and ``AMBID_MQTT_PASSWORD``: no list of processes shows them.
-
-    Parameters
-    ----------
-    watched : Watched
-        From `watch`.
-    where : str
-        ``[mqtts://]HOST[:PORT]/TOPIC``; with ``mqtts://`` over TLS. The topic of a bearing is ``TOPIC/its name``.
-
-    Returns
-    -------
-    int
-        Messages that the broker has confirmed.
-
-    Raises
-    ------
-    AmbidError
-        If paho-mqtt is not installed, the address is none, or the broker does not take the messages.
-    """
-    with needs("paho-mqtt", setting("publish"), "mqtt"):
-        from paho.mqtt.client import Client, MQTTv5
-        from paho.mqtt.enums import CallbackAPIVersion
-    if "@" in where:
-        raise AmbidError(
-            f"{setting('publish')} takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead"
-        )
-    plain = where.removeprefix("mqtts://")
-    address, _, topic = plain.removeprefix("mqtt://").partition("/")
-    host, _, port = address.partition(":")
-    secure = plain != where
-    if not host or not topic.strip("/") or set(topic) & set("+#") or not (not port or port.isdigit()):
-        raise AmbidError(
-            f"{setting('publish')} is {where!r}; it must be HOST[:PORT]/TOPIC, such as localhost/works. Correct it"
-        )
-    replies = Queue[str]()
-    client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
-    client.on_connect = lambda *given: replies.put("" if not given[3].is_failure else str(given[3]))
-    if secure:
-        client.tls_set()
-    if "AMBID_MQTT_USER" in os.environ:
-        client.username_pw_set(os.environ["AMBID_MQTT_USER"], os.environ.get("AMBID_MQTT_PASSWORD", ""))
-    try:
-        client.connect(host, int(port) if port else 8883 if secure else 1883)
-        client.loop_start()
-        refused = replies.get(timeout=PATIENCE_S)
-        if refused:
-            raise AmbidError(f"{setting('publish', where)}: {refused}. Check user and password")
-        sent = [
-            client.publish(f"{topic.strip('/')}/{_plain(s.bearing)}", message(watched, s), qos=1, retain=True)
-            for s in watched.states
-        ]
-        for one in sent:
-            one.wait_for_publish(PATIENCE_S)
-        lost = sum(not one.is_published() for one in sent)
-        if lost:
-            raise AmbidError(
-                f"{setting('publish', where)}: the broker did not confirm {counted(lost, 'message')}. Check it"
-            )
-    except Empty:
-        raise AmbidError(
-            f"{setting('publish', where)}: the broker was silent for {PATIENCE_S:.0f} s. Check it"
-        ) from None
-    except (OSError, ValueError, RuntimeError) as failure:
-        raise AmbidError(f"{setting('publish', where)}: {failure}. Check broker, user and network") from None
-    finally:
-        client.disconnect()
-        client.loop_stop()
-    return len(sent)
-
-
-def _plain(name: str) -> str:
-    """A bearing's name as one level of a topic."""
-    return "".join("_" if c in "+#/\0" else c for c in name)
-
-
 def _latest(h: History) -> dict[str, dict[str, Any]]:
     """Return the latest known number of each parameter."""
     latest = {}
@@ -171,17 +86,3 @@ def _latest(h: History) -> dict[str, dict[str, Any]]:
                 "value": float(s.value[k]), "sd": float(s.sd[k]), "unit": s.unit, "taken_at": float(s.taken_at[k]),
             }  # fmt: skip
     return latest
-
-
-def message(watched: Watched, s: Now) -> str:
-    """Return what is published of a bearing, as JSON."""
-    values = {name: x for h in watched.used or () if h.bearing == s.bearing for name, x in _latest(h).items()}
-    for x in values.values():
-        x["age_s"] = watched.at - x["taken_at"]
-    return json.dumps(plain_json(
-        {
-            "schema": "ambid.message/1", "bearing": s.bearing, "at": watched.at, "taken_at": s.latest,
-            "verdict": s.verdict, "success_at": s.success, "overdue_s": s.overdue_s, "failures": s.failures,
-            "values": values, "alarms": [asdict(a) for a in watched.standing if a.bearing == s.bearing],
-        }
-    ))  # fmt: skip

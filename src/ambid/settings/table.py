@@ -121,9 +121,7 @@ SETTINGS = (
         shown="the operating point's"),
     Setting("preset", "text", "NAME", "Instead of a record: the rig of a bench that 'ambid models' lists; prototype "
         "has a controller."),
-    Setting("publish", "text", "FILE.prom|HOST[:PORT]/TOPIC", "Tell latest values and alarms: to Prometheus by a "
-        "file, or to a broker of MQTT (user and password: AMBID_MQTT_USER, AMBID_MQTT_PASSWORD); repeatable; needs "
-        "@alarms.", many=True),
+    Setting("publish", "path", "FILE.prom", "Write latest values and alarms as gauges for Prometheus; needs @alarms."),
     Setting("rate_hz", "positive", "HZ", "Sampling rate in Hz, for a record without time."),
     Setting("read_only", "switch", "", "Refuse what changes something."),
     Setting("record", "path", "RECORD", "Record: .csv, .csv.gz, .h5, .mat, .tdms, .mf4, .mdf, .parquet, .feather or "
