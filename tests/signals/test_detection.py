@@ -7,7 +7,7 @@ import pytest
 
 from ambid.errors import RecordError
 from ambid.signals import find_dropouts, find_outliers, find_saturation, resolution
-from ambid.signals.excitations import prbs, steps
+from ambid.signals.excitations import prbs
 
 RATE = 1000.0
 N = 10000
@@ -22,7 +22,7 @@ def clean_signals() -> dict[str, np.ndarray]:
     """Signals without any fault, noise-free and noisy, as they occur on a bench."""
     from scipy.signal import lfilter
 
-    stairs = steps(N, RATE, amplitude=1.0, hold_s=0.5)
+    stairs = np.resize(np.repeat([0.0, 1.0, 0.0, -1.0], round(0.5 * RATE)), N)
     binary = prbs(N, RATE, amplitude=1.0, hold=10)
     lag = ([0.0, 0.1], [1.0, -0.9])
     return {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from inspect import signature
 from math import ceil, log2
 from types import MappingProxyType
 from typing import Literal
@@ -17,7 +16,7 @@ from ambid.errors import AmbidError, choices
 AmplitudeIs = Literal["peak", "rms"]
 
 
-def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs) -> Array:
+def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs = "peak") -> Array:
     """Return samples (n_samples,), not all zero, scaled so that their largest absolute value, or their rms, is
     `amplitude`.
     """
@@ -50,56 +49,21 @@ def checked_band(band: tuple[float, float], rate_hz: float) -> tuple[float, floa
     return low, high
 
 
-def steps(
-    n_samples: int,
-    rate_hz: float,
-    *,
-    amplitude: float,
-    hold_s: float,
-    levels: Sequence[float] = (0.0, 1.0, 0.0, -1.0),
-    amplitude_is: AmplitudeIs = "peak",
-) -> Array:
-    """Return steps that run through `levels`, holding each for `hold_s`, over and over."""
+def steps(n_samples: int, rate_hz: float, *, amplitude: float) -> Array:
+    """Return steps through 0, 1, 0, -1 times the amplitude, an eighth of the signal each, and over again."""
     checked(n_samples, rate_hz)
-    hold = round(hold_s * rate_hz)
-    if hold < 1:
-        raise AmbidError(
-            f"steps held for {hold_s:g} s at {rate_hz:g} Hz are shorter than a sample. Give a longer hold_s"
-        )
-    heights = np.asarray(levels, dtype=np.float64)
-    x = heights[(np.arange(n_samples) // hold) % heights.size]
-    if np.ptp(x) == 0.0:
-        raise AmbidError(
-            f"steps held for {hold_s:g} s give no step in {n_samples / rate_hz:g} s. Give a shorter hold_s"
-        )
-    return scaled(x, amplitude, amplitude_is)
+    heights = np.array([0.0, 1.0, 0.0, -1.0])
+    x = heights[(np.arange(n_samples) // max(1, round(n_samples / 8))) % heights.size]
+    return scaled(x, amplitude)
 
 
-def chirp(
-    n_samples: int,
-    rate_hz: float,
-    *,
-    amplitude: float,
-    band: tuple[float, float],
-    sweep: Literal["linear", "log"] = "linear",
-    amplitude_is: AmplitudeIs = "peak",
-) -> Array:
-    """Return a sine whose frequency runs once through the band, starting at phase 0.
-
-    Linear: φ = 2π (f0 t + (f1 - f0) t²/(2 T)); logarithmic: φ = 2π f0 T/ln(f1/f0) ((f1/f0)^(t/T) - 1).
-    """
+def chirp(n_samples: int, rate_hz: float, *, amplitude: float, band: tuple[float, float]) -> Array:
+    """Return a sine of phase φ = 2π (f0 t + (f1 - f0) t²/(2 T)), whose frequency runs once through the band."""
     checked(n_samples, rate_hz)
     low, high = checked_band(band, rate_hz)
     t, duration = np.arange(n_samples) / rate_hz, n_samples / rate_hz
-    if sweep == "linear":
-        turns = low * t + (high - low) * t**2 / (2.0 * duration)
-    elif sweep == "log":
-        if low == 0.0:
-            raise AmbidError("a logarithmic chirp cannot start at 0 Hz. Give a low end over 0, or sweep='linear'")
-        turns = low * duration / np.log(high / low) * ((high / low) ** (t / duration) - 1.0)
-    else:
-        raise AmbidError(f"chirp sweep {sweep!r}; it must be 'linear' or 'log'. Give one of them")
-    return scaled(np.sin(2.0 * np.pi * turns), amplitude, amplitude_is)
+    turns = low * t + (high - low) * t**2 / (2.0 * duration)
+    return scaled(np.sin(2.0 * np.pi * turns), amplitude)
 
 
 def prbs(
@@ -110,7 +74,6 @@ def prbs(
     bits: int | None = None,
     hold: int = 1,
     seed: int | np.random.Generator = 0,
-    amplitude_is: AmplitudeIs = "peak",
 ) -> Array:
     """Return a maximum-length pseudo-random binary sequence of ±amplitude: `bits` bits give a period of 2^bits - 1
     ticks, mean amplitude/(2^bits - 1) and a two-valued periodic autocorrelation (Ljung 1999, sec. 13.3). The spectrum
@@ -119,18 +82,14 @@ def prbs(
     from scipy.signal import max_len_seq
 
     checked(n_samples, rate_hz)
-    if hold < 1:
-        raise AmbidError(f"PRBS tick of {hold} samples; it must be at least 1. Give another hold")
     ticks = -(-n_samples // hold)
     if bits is None:
         bits = max(4, int(ticks).bit_length())
-    if not 2 <= bits <= 31:
-        raise AmbidError(f"PRBS register of {bits} bits; it must have 2 to 31. Give another number of bits")
     start = np.random.default_rng(seed).integers(1, 2**bits)
     register = np.array([(int(start) >> k) & 1 for k in range(bits)], dtype=np.int8)
     sequence = max_len_seq(bits, state=register, length=ticks)[0]
     x = np.repeat(2.0 * sequence - 1.0, hold)[:n_samples]
-    return scaled(x, amplitude, amplitude_is)
+    return scaled(x, amplitude)
 
 
 def gaussian(
@@ -140,7 +99,6 @@ def gaussian(
     amplitude: float,
     band: tuple[float, float] | None = None,
     seed: int | np.random.Generator = 0,
-    amplitude_is: AmplitudeIs = "rms",
 ) -> Array:
     """Return Gaussian noise, white or confined to a band."""
     checked(n_samples, rate_hz)
@@ -156,7 +114,7 @@ def gaussian(
                 f"or make it longer"
             )
         x = np.fft.irfft(np.where(inside, lines, 0.0), n_samples)
-    return scaled(x, amplitude, amplitude_is)
+    return scaled(x, amplitude, "rms")
 
 
 def multisine(
@@ -311,18 +269,16 @@ def _flattened(period: int, numbers: np.ndarray, size: Array, angle: Array, iter
 
 
 def _prbs_in_band(
-    n_samples: int, rate_hz: float, *, band: tuple[float, float] | None = None, **options: object
-) -> Array:
+    n_samples: int, rate_hz: float, *, amplitude: float, band: tuple[float, float] | None = None,
+    seed: int | np.random.Generator = 0,
+) -> Array:  # fmt: skip
     """PRBS with its half-power frequency 0.44/tick at the top of the band and a line at its bottom or under."""
+    hold, bits = 1, None
     if band is not None:
         low, high = checked_band(band, rate_hz)
-        if {"hold", "bits"} & options.keys():
-            raise AmbidError("prbs got a band and hold or bits; the band sets both. Give the band or them")
         hold = max(1, int(0.44 * rate_hz / high))
-        options["hold"] = hold
-        if low > 0.0:
-            options["bits"] = max(2, ceil(log2(rate_hz / (hold * low) + 1.0)))
-    return prbs(n_samples, rate_hz, **options)  # type: ignore[arg-type]
+        bits = max(2, ceil(log2(rate_hz / (hold * low) + 1.0))) if low > 0.0 else None
+    return prbs(n_samples, rate_hz, amplitude=amplitude, bits=bits, hold=hold, seed=seed)
 
 
 AXES_EXCITATIONS = ("zippered", "orthogonal")
@@ -421,7 +377,7 @@ def excitation_of_axes(
         angle = np.random.default_rng([seed, j]).uniform(0.0, 2.0 * np.pi, own.size)
         turned = [angle + 2.0 * np.pi * b * k / blocks for b in range(blocks)]
         parts = [np.tile(_flattened(period, own, np.ones(own.size), phases, 0), periods) for phases in turned]
-        waves[:, j] = scaled(np.concatenate(parts), amplitude, "peak")
+        waves[:, j] = scaled(np.concatenate(parts), amplitude)
     return waves
 
 
@@ -448,7 +404,6 @@ def excitation(
     amplitude: float,
     band: tuple[float, float] | None = None,
     seed: int | np.random.Generator = 0,
-    **options: object,
 ) -> Array:
     """Make an excitation by name.
 
@@ -460,15 +415,12 @@ def excitation(
     rate_hz : float
         Sampling rate in Hz.
     amplitude : float
-        Peak (rms for ``gaussian``) in the unit of the result, unless the option ``amplitude_is`` says otherwise.
+        Peak (rms for ``gaussian``) in the unit of the result.
     band : (float, float), Hz, optional
         Default: one period over the record to a fifth of the rate for chirp and multisines, all for prbs and gaussian.
-        Steps have none: their option is ``hold_s``, an eighth of the duration by default.
+        Steps have none.
     seed : int or numpy.random.Generator
         The same seed gives the same samples. Steps and chirp have none.
-    **options : object
-        All: ``amplitude_is`` ("peak" or "rms"). Steps: ``hold_s``, ``levels``. Chirp: ``sweep`` ("linear" or "log").
-        Prbs: ``bits`` of the register, 2 to 31, and ``hold``, samples of a tick. Multisines: those of `multisine`.
 
     Returns
     -------
@@ -477,24 +429,16 @@ def excitation(
     Raises
     ------
     AmbidError
-        If the name or an option is unknown (the message names the nearest), or a setting is out of range.
+        If the name is unknown (the message names the nearest), or a setting is out of range.
     """
     if name in AXES_EXCITATIONS:
         raise AmbidError(f"excitation {name!r} is over the axes of a rotor; this bench has one axis. Give multisine")
     _refuse_unknown(name, tuple(EXCITATIONS))
     checked(n_samples, rate_hz)
-    function = prbs if name == "prbs" else EXCITATIONS[name]
-    own = {"n_samples", "rate_hz", "amplitude", "band", "seed"} | ({"phases"} if name == "schroeder" else set())
-    allowed = [p for p in signature(function).parameters if p not in own]
-    for option in options:
-        if option not in allowed:
-            raise AmbidError(f"excitation {name!r} has no option {option!r}; it has {choices(option, allowed)} Omit it")
-    settings: dict[str, object] = {"amplitude": amplitude, **options}
-    if name == "steps":
-        if band is not None:
-            raise AmbidError("excitation 'steps' has no band. Omit the band, or choose 'prbs' for steps in a band")
-        settings.setdefault("hold_s", n_samples / rate_hz / 8.0)
-    elif band is not None:
+    settings: dict[str, object] = {"amplitude": amplitude}
+    if name == "steps" and band is not None:
+        raise AmbidError("excitation 'steps' has no band. Omit the band, or choose 'prbs' for steps in a band")
+    if band is not None:
         settings["band"] = band
     elif name in _NEED_BAND:
         settings["band"] = (rate_hz / n_samples, rate_hz / 5.0)
