@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import RecordError
-from ambid.signals import cut, lowpass, remove_trend, replace_samples
+from ambid.signals import cut, remove_trend, replace_samples
 
 RATE = 1000.0
 T = np.arange(4000) / RATE
@@ -19,8 +19,7 @@ def sine(hz: float) -> np.ndarray:
 def test_the_record_given_is_not_changed(make):
     r = make(RATE, x=sine(5) + 3.0)
     before = r["x"].values.copy()
-    for step in (remove_trend, lambda q: lowpass(q, 50.0)):
-        step(r)
+    remove_trend(r)
     np.testing.assert_array_equal(r["x"], before)
     assert r.history == ()
 
@@ -31,38 +30,12 @@ def test_polynomial_trend_is_removed_exactly(make, degree):
     assert np.max(np.abs(remove_trend(make(RATE, x=trend), degree=degree)["x"])) < 1e-9 * np.max(np.abs(trend))
 
 
-def test_lowpass_shifts_nothing_in_the_passband_and_halves_at_the_cutoff(make):
-    r = lowpass(make(RATE, a=sine(10), b=sine(100), c=sine(350)), 100.0)
-    middle = slice(500, -500)
-    assert np.max(np.abs(r["a"] - sine(10))[middle]) < 1e-6
-    assert np.max(np.abs(r["b"] - 0.5 * sine(100))[middle]) < 1e-3
-    assert np.max(np.abs(r["c"])[middle]) < 1e-4
-
-
-def test_lowpass_of_all_channels_leaves_their_linear_relation(make):
-    # y = 3 u(t-2): filtering both alike must keep the relation (away from the ends).
-    u = np.random.default_rng(1).standard_normal(T.size)
-    r = lowpass(make(RATE, u=u, y=3.0 * np.roll(u, 2)), 80.0)
-    assert np.max(np.abs(r["y"][202:-200] - 3.0 * r["u"][200:-202])) < 1e-9
-
-
-@pytest.mark.parametrize("settings", [{"cutoff_hz": 500.0}, {"cutoff_hz": 0.0}, {"cutoff_hz": 50.0, "order": 13}])
-def test_lowpass_refuses_what_it_cannot_do(make, settings):
-    with pytest.raises(RecordError, match="must"):
-        lowpass(make(RATE, x=sine(5)), **settings)
-
-
-def test_lowpass_refuses_a_record_shorter_than_its_memory(make):
-    with pytest.raises(RecordError, match="too few"):
-        lowpass(make(RATE, x=np.zeros(30)), 10.0)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_values_that_are_not_finite_are_refused_by_place(make, bad):
     x = sine(5).copy()
     x[17] = bad
     with pytest.raises(RecordError, match="sample 17"):
-        lowpass(make(RATE, x=x), 50.0)
+        remove_trend(make(RATE, x=x))
 
 
 def test_cut_takes_from_inclusive_to_exclusive_on_the_records_clock(make):

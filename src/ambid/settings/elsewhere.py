@@ -35,7 +35,7 @@ RECORD: Mapping[str, str] = {
     **dict.fromkeys(("iloc", "loc", "head", "tail", "resample", "values", "corr"), "to_dataframe().{0}"),
     **dict.fromkeys(("to_csv", "to_hdf", "write"), "save(file)"), "fft": "plot()", "detrend": "ambid.signals",
     **dict.fromkeys(("to_pandas", "copy", "rename", "drop", "describe", "info"), "to_dataframe()"),
-    **dict.fromkeys(("psd", "filter"), "ambid.signals"), "cut": "record[from_s:to_s]",
+    "psd": "ambid.signals", "filter": "scipy.signal.sosfiltfilt(sos, record['name'])", "cut": "record[from_s:to_s]",
     **dict.fromkeys(("u", "InputData", "y", "OutputData"), "record['name']"),
 }  # fmt: skip
 """Of a record; a part of one is ``record[0.5:2.0]``, in seconds."""

@@ -8,7 +8,6 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.record import cut as cut
-    from ambid.signals.conditioning import lowpass as lowpass
     from ambid.signals.conditioning import remove_trend as remove_trend
     from ambid.signals.conditioning import replace_samples as replace_samples
     from ambid.signals.delay import find_delay as find_delay

@@ -1,4 +1,4 @@
-"""Steps on a record before it is used: replace samples, remove a trend, filter."""
+"""Steps on a record before it is used: replace samples, remove a trend."""
 
 from __future__ import annotations
 
@@ -147,60 +147,3 @@ def polynomial_trend(x: Array, degree: int) -> Array:
     coefficients = np.linalg.lstsq(basis, x, rcond=None)[0]
     trend: Array = basis @ coefficients
     return trend
-
-
-def lowpass(record: Record, cutoff_hz: float, names: str | Sequence[str] | None = None, *, order: int = 4) -> Record:
-    """Low-pass channels forwards and backwards, so that nothing is delayed.
-
-    Filtering input and output of an identification differently puts the ratio of the filters into the plant; alike, it
-    only weights the frequencies (Ljung 1999, sec. 14.4). A zero-phase filter looks ahead: it is for records, not for
-    control, and an estimator that models its noise (grey-box, ARMAX) is better fed the raw record.
-
-    Parameters
-    ----------
-    record : Record
-    cutoff_hz : float
-        Frequency in Hz where the two passes together give -6 dB.
-    names : str or sequence of str, optional
-        Channels; all of them by default.
-    order : int
-        Of the Butterworth filter of one pass, 1 to 12.
-
-    Returns
-    -------
-    Record, a new one with the step in its history
-
-    Raises
-    ------
-    RecordError
-        If the cutoff is not between 0 and half the rate, the order is out of range or the record is too short.
-    """
-    which = chosen(record, names)
-    step = Step(name="lowpass", settings={"channels": list(which), "cutoff_hz": float(cutoff_hz), "order": order})
-    return mapped(record, which, step, lambda x: zero_phase(x, record.rate_hz, float(cutoff_hz), order=order))
-
-
-def zero_phase(x: Array, rate_hz: float, corner_hz: float, *, order: int) -> Array:
-    """Filter samples (n_samples,) forwards and backwards with a Butterworth low-pass in second-order sections, of
-    `order` 1 to 12 in one pass; both together give -6 dB at the corner and no delay.
-    """
-    from scipy.signal import butter, sosfiltfilt
-
-    if not 0.0 < corner_hz < rate_hz / 2:
-        raise RecordError(
-            f"lowpass corner {corner_hz:g} Hz at a rate of {rate_hz:g} Hz; it must lie between 0 and half the rate "
-            f"({rate_hz / 2:g} Hz). Give another corner"
-        )
-    if not 1 <= order <= 12:
-        raise RecordError(f"lowpass order {order}; it must be 1 to 12. Give a lower order")
-    # The padding covers the filter's memory (about one period of the corner), or the ends would ring.
-    padding = max(6 * order, round(2 * rate_hz / corner_hz))
-    if x.size <= padding:
-        raise RecordError(
-            f"{x.size} samples are too few for a lowpass at {corner_hz:g} Hz and {rate_hz:g} Hz rate; it needs more "
-            f"than {padding}. "
-            "Use a longer record, or a higher corner"
-        )
-    sections = butter(order, corner_hz, fs=rate_hz, output="sos")
-    filtered: Array = np.ascontiguousarray(sosfiltfilt(sections, x, padlen=padding))
-    return filtered
