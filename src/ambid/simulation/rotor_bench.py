@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
-from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.nonlinear import OperatingPoint
@@ -36,7 +35,6 @@ from ambid.simulation.plant import (
     fed_back,
     law_on,
     matrices_of,
-    signals_fed_back,
 )
 from ambid.simulation.rig_bench import FINE, as_columns, loop_of_rig
 from ambid.simulation.variation import Integers, Schedule
@@ -165,19 +163,7 @@ class Running:
     z: Array  # states of the law
     memory: Array  # (n_axes, 3), of gains
     line: Array  # commands on their way, (whole delay + 2, n_axes)
-    law: StateLaw | None
     angle: float = 0.0  # of the rotor at the next sample, rad
-
-    def hand_over(self, law: StateLaw, y: Array) -> None:
-        """Go on with another law, whose states order of themselves what those of the last one would: by least squares
-        over samples; then z+ = z + C⁺ (w - C z - D y), w what the last law would order.
-        """
-        assert self.law is not None
-        wanted, n = self.law.C @ self.z + self.law.D @ y, 2 * max(self.law.order, law.order)
-        old, new = _free(self.law, n), _free(law, n)
-        size = np.maximum(np.linalg.norm(new, axis=0), 1e-300)
-        z = np.linalg.lstsq(new / size, old @ self.z, rcond=_TOLD)[0] / size
-        self.z, self.law = z + np.linalg.pinv(law.C) @ (wanted - law.C @ z - law.D @ y), law
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -201,30 +187,17 @@ class _Fixed(NamedTuple):
     """What the compiled loop is given of a bench, each stretch the same."""
 
     size: Array  # of the noise of outputs, then disturbances
-    read: Array  # outputs of states
-    law: StateLaw | None
     before_line: tuple[Any, Any, Any, Any, Any, Any, Any]  # arguments of the kernel, in its order
     after_stops: tuple[Array, Array, Integers]
 
     def towards(self, other: _Fixed, share: float) -> _Fixed:
-        """Return what lies between this speed and another; the law is that of this one."""
+        """Return what lies between this speed and another."""
         equations, *rest = self.before_line
         between = tuple(
             a + share * (b - a) if isinstance(a, np.ndarray) and a.dtype == np.float64 and a.size else a
             for a, b in zip(equations, other.before_line[0], strict=True)
         )
         return self._replace(before_line=(between, *rest))
-
-
-_TOLD = 1e-6  # of the largest singular value, from which commands tell of states
-
-
-def _free(law: StateLaw, n: int) -> Array:
-    """Return what `n` samples of a law's commands are of its states alone, (n * n_u, order)."""
-    rows = [law.C]
-    for _ in range(n - 1):
-        rows.append(rows[-1] @ law.A)
-    return np.vstack(rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -343,8 +316,6 @@ class RotorBench:
         for first, stop, fixed in self._stretches(w, course):
             if first % _CHUNK == 0:
                 noise = rng.standard_normal((_CHUNK, fixed.size.size)) * fixed.size
-            if fixed.law is not None and fixed.law is not at.law:
-                at.hand_over(fixed.law, (fixed.read @ at.x)[signals_fed_back(self.model)])
             at.x[-2:] = math.cos(angle[first]), math.sin(angle[first])
             part, counts = slice(first, stop), np.array([-1, -1, 0], dtype=np.int64)
             lost = self._run(at, fixed, still[: stop - first], noise[first % _CHUNK :][: stop - first],
@@ -462,8 +433,6 @@ class RotorBench:
         disturbed = rng.standard_normal((n, fixed.size.size)) * fixed.size
         if load is not None:
             disturbed[:, len(rotor.outputs) : len(rotor.outputs) + len(rotor.axes)] += load
-        if fixed.law is not None and fixed.law is not at.law:
-            at.hand_over(fixed.law, (fixed.read @ at.x)[signals_fed_back(rotor)])
         turn = rotor.speed / self.rate_hz
         moved = self._motion(n, np.asarray(at.angle + np.arange(n, dtype=np.float64) * turn))
         at.angle += n * turn
@@ -525,7 +494,7 @@ class RotorBench:
         sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
         read, law = np.ascontiguousarray(continuous.C), law_on(c, rotor, self.rate_hz)
         return _Fixed(
-            size=np.array([sizes[kind_of(name)] for name in (*rotor.outputs, *rotor.disturbances)]), read=read, law=law,
+            size=np.array([sizes[kind_of(name)] for name in (*rotor.outputs, *rotor.disturbances)]),
             before_line=(
                 equations, read, fed_back(rotor), np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
                 matrices_of(law), np.array(steps[:-1]), (*getattr(self.limits, kind_of(rotor.inputs[0])), steps[-1]),
@@ -535,12 +504,12 @@ class RotorBench:
 
     def begun(self, start: Array | None = None) -> Running:
         """Return the loop at its beginning, with some states of the plant, by default at rest."""
-        rotor, law, n = self.model, self._fixed.law, len(self.model.inputs)
+        rotor, law, n = self.model, law_on(self.loop, self.model, self.rate_hz), len(self.model.inputs)
         x, memory = np.zeros(len(rotor.states) + 2), np.zeros((n, 3))
         x[: len(rotor.states)] = 0.0 if start is None else start
         x[-2], memory[:, 2] = 1.0, np.nan
         line = np.zeros((math.floor(self.loop.delay) + 2, n))
-        return Running(x=x, z=np.zeros(0 if law is None else law.order), memory=memory, line=line, law=law)
+        return Running(x=x, z=np.zeros(0 if law is None else law.order), memory=memory, line=line)
 
     def _continuous(self, theta: Mapping[str, float] | None = None) -> StateSpace:
         """Return the plant; after its states cos and sin of the angle, from which unbalance pushes."""
