@@ -461,7 +461,7 @@ def test_the_loop_of_a_rotor_is_told_axis_by_axis():
 @pytest.fixture(scope="module")
 def rotor(tmp_path_factory):
     """A rotor's rig, and an estimate of it."""
-    rig, made = rig_of_preset(preset("camb")), tmp_path_factory.mktemp("rotor")
+    rig, made = rig_of_preset(preset("spindle")), tmp_path_factory.mktemp("rotor")
     write_rig(rig, made / "rotor.toml")
     identify(simulate(rig, duration=3.0, seed=1), rig).save(made / "start.json")
     return made

@@ -16,7 +16,7 @@ from tests.console.browser import NEEDED, SIZES, chromium
 from tests.console.pages import console
 
 pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
-RIG = rig_of_preset(preset("camb"))
+RIG = rig_of_preset(preset("spindle"))
 LONG_S = 120.0
 
 
@@ -42,7 +42,7 @@ def test_an_orbit_is_that_of_the_unbalance():
             n += len(block.values)
             orbits.take(block.values, n / 20_000)
     (_, about), (_, last) = feed.said[0], feed.said[-1]
-    assert about == {"bearings": {"A": ["ax", "ay"], "B": ["bx", "by"]}, "rpm": pytest.approx(6000.0), "turns": 2.0,
+    assert about == {"bearings": {"A": ["ax", "ay"], "B": ["bx", "by"]}, "rpm": pytest.approx(30_000.0), "turns": 2.0,
                      "stop": 2e-4}  # fmt: skip
     for name in "AB":
         x, y = (np.array(v) for v in last["of"][name])
@@ -131,7 +131,7 @@ class TestPage:
         shown = page.evaluate("Object.keys(ambidConsole.feed.lines.at(-1).values)")
         assert {f"{axis}.{q}" for axis in RIG.rotor.axes for q in ("k_i", "k_x", "R")} <= set(shown)
         assert "Measured at the excited lines" in page.text("#loop")
-        assert page.evaluate("$('speed').value") == "6000"
+        assert page.evaluate("$('speed').value") == "30000"
         assert page.count("[data-say]:disabled") == 4  # a rotor's tracker is led by nobody
         for size in SIZES:
             page.resize(*size)

@@ -31,7 +31,7 @@ def bench_of(name):
 
 @pytest.fixture(scope="module")
 def turning():
-    return bench_of("camb")
+    return bench_of("spindle")
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -18,7 +18,7 @@ from ambid.record import write_record
 from ambid.rig import rig_of_preset
 from ambid.simulation.rotor_bench import RotorBench
 
-RIG = rig_of_preset(preset("camb"))  # five axes, at 6000 rpm
+RIG = rig_of_preset(preset("spindle"))  # five axes, at 30 000 rpm
 TRUTH = RotorBench.of(RIG, None, True).plant.parameters
 SILENT = Course(mode="levitate", seconds=4.0)
 

@@ -38,7 +38,6 @@ class RotorBody:
     runout: tuple[Turning, ...] = ()
     gap: float = 0.0  # of the magnets at the centre, m, for the nonlinear law
     sigma: float = 0.0  # saturation of their iron, 1/A^2
-    cone: float = 0.0  # angle of the pole faces in rad, by which radial magnets act along the shaft too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -253,46 +252,6 @@ def _rmit() -> Preset:
     )
 
 
-def _camb() -> Preset:
-    """Each pole pair has W' = k i^2/(2 d) (thesis eq. 1.9); an axis current moves its coils by a unit combination.
-    Stator A pulls to -z, B to +z. With cone angle c a radial axis has k_i = 2 k i0 cos(c)/s^2, the axial one, whose
-    current adds half of itself to every coil of B and takes it from every coil of A, k_i = 4 k i0 sin(c)/s^2.
-    """
-    axes, cone, gap, bias = ("ax", "ay", "bx", "by"), math.atan(0.5), 0.4e-3, 1.5
-    pair = DifferentialPair(turns=90, area=500e-6, bias=bias, gap=gap, leakage=1e-3)
-    k, numbers = pair.coenergy.k_a, dict[str, float]()
-    for axis in (*axes, "az"):
-        along = 2.0 * math.sin(cone) if axis == "az" else math.cos(cone)
-        force = {"k_i": 2.0 * k * bias * along / gap**2, "k_x": -2.0 * k * (bias * along) ** 2 / gap**3}
-        coil = {"R": 1.0, "L": pair.coenergy.inductance(0.0)}
-        numbers |= {f"{axis}.{name}": x for name, x in {**force, **coil}.items()}
-    rigid = {"m": 3.0, "Id": 0.012, "Ip": 0.0026, "z_cg": 0.10}
-    # Sources: force law: thesis eq. 1.9; pole pairs, differential drive: thesis sec. 1.5: eight teeth in four
-    # pairs a stator; turns, area, bias, gap, cone angle, m, Id, Ip, planes, R, leakage, speed, unbalance, loop,
-    # noise, limits, rate_hz: chosen
-    return Preset(
-        name="camb",
-        summary="conical bearings: two claw stators of four pole pairs; five axes, the axial one by the cone angle",
-        model="rotor",
-        parameters={**rigid, **numbers},
-        rotor=RotorBody(
-            model=RotorModel(
-                bearings=(
-                    _radial("A", ("ax", "ay"), 0.03, 0.05), _radial("B", ("bx", "by"), 0.17, 0.15),
-                    Bearing(name="T", axes=("az",), axial=True),
-                ),
-                speed=6000.0 * _RPM, polar=True,
-            ),
-            unbalance=(Turning(name="rotor", value=3e-6, phase=0.3, z=0.10),),
-            gap=gap, sigma=0.01, cone=cone,
-        ),
-        loop=Loop(kp=2.0e5, ki=1.8e6, kd=450.0, kc=25.0, derivative_cutoff_hz=2500.0, delay=1.0),
-        noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.3, voltage=0.05),
-        limits=Limits(voltage=(-60.0, 60.0), current=(-1.4, 1.4), position=(-0.2e-3, 0.2e-3)),
-        rate_hz=20_000.0,
-    )  # fmt: skip
-
-
 def _central_mass() -> Preset:
     axes = ("ax", "ay", "bx", "by")
     magnet = DifferentialPair(turns=110, area=300e-6, bias=1.5, gap=0.45e-3, half_angle=0.392, leakage=1.5e-3)
@@ -353,7 +312,7 @@ def _spindle() -> Preset:
     )  # fmt: skip
 
 
-_ROTORS = {"utrc": _utrc, "rmit": _rmit, "camb": _camb, "central-mass": _central_mass, "spindle": _spindle}
+_ROTORS = {"utrc": _utrc, "rmit": _rmit, "central-mass": _central_mass, "spindle": _spindle}
 _MAKERS = {
     "thesis": _thesis,
     "unstable-bearing": _unstable_bearing,

@@ -297,7 +297,7 @@ def rig_of_preset(bench: Preset) -> Rig:
         rig, rotor=rotor, shaft=body.shaft, unbalance=body.unbalance, runout=body.runout,
         modes=RigModes(count=body.model.n_modes or None) if body.shaft else RigModes(),
         magnet=RigMagnet(
-            kind="pair", gap="hyperbolic", saturation=True if body.sigma else None, cone=body.cone,
+            kind="pair", gap="hyperbolic", saturation=True if body.sigma else None,
             parameters=tuple(Parameter(name=n, unit=specs[n].unit, value=x, role="fixed") for n, x in numbers.items()),
         ),
     )  # fmt: skip

@@ -444,13 +444,8 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
     specs = {spec.name: spec for spec in BEARING_NUMBERS}
     if isinstance(plant, RotorModel):
         specs = {n: specs[n] for n in ("s", "sigma")}  # the others follow from k_i, k_x and L of each axis
-        if entry.kind == "single" or entry.cone >= 0.5 * math.pi:
-            raise RigError(
-                f"{where}: magnet.kind is {entry.kind!r} and magnet.cone {entry.cone:g} rad; a rotor has pairs, with a "
-                "cone below pi/2. Correct them"
-            )
-    elif entry.cone:
-        raise RigError(f"{where}: magnet.cone is given, but no [bearings.X]. Remove it, or add its bearings")
+        if entry.kind == "single":
+            raise RigError(f"{where}: magnet.kind is 'single'; a rotor has pairs. Correct it")
     for name, given in entry.parameters.items():
         place = f"{where}: magnet.parameters.{name}"
         if name in ("m", "R", "c"):

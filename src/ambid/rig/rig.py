@@ -158,8 +158,6 @@ class RigMagnet:
         Whether the force has a pole a/(s + a), and whether a force and a voltage drift beside the law.
     off_below : float or None
         Voltage in V at or below which the power stage is off, so that the coil's voltage is not known.
-    cone : float
-        Of a rotor: angle of its pole faces to the shaft in rad, by which radial magnets act on the axial axis too.
     parameters : tuple of Parameter
         Numbers of which something is known, SI; a number that is absent takes its default role.
     """
@@ -172,7 +170,6 @@ class RigMagnet:
     eddy: bool = False
     drift: bool = False
     off_below: float | None = None
-    cone: float = 0.0
     parameters: tuple[Parameter, ...] = ()
 
     def __post_init__(self) -> None:
@@ -607,7 +604,7 @@ def _magnet_lines(magnet: RigMagnet) -> list[str]:
     entries = {
         "kind": magnet.kind, "gap": magnet.gap, "saturation": magnet.saturation, "eddy": magnet.eddy or None,
         "drift": magnet.drift or None, "asymmetric": magnet.asymmetric, "rise": magnet.rise,
-        "off_below": magnet.off_below, "cone": magnet.cone or None,
+        "off_below": magnet.off_below,
     }  # fmt: skip
     lines = ["[magnet]", *toml_lines(entries)]
     return [*lines, "[magnet.parameters]", *_parameter_lines(magnet.parameters)] if magnet.parameters else lines

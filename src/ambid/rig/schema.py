@@ -180,7 +180,6 @@ class MagnetEntry(_Entry):
     eddy: Annotated[bool, Field(strict=True)] = False
     drift: Annotated[bool, Field(strict=True)] = False
     off_below: Number | None = None
-    cone: NotNegative = 0.0
     parameters: dict[str, ParameterEntry] = Field(default_factory=dict)
 
 

@@ -370,8 +370,8 @@ def rate(
     room: Array,
 ) -> bool:
     """Write the derivative of the states; tell whether all gaps are open. `motion`, `moving`, `voltage`, `force`
-    (n_axes,): what each axis sees of the rotor and of its speed, with disturbances; `room` (n_axes, n_axes + 2):
-    inductances, what drives currents, force.
+    (n_axes,): what each axis sees of the rotor and of its speed, with disturbances; `room` (n_axes, 3): inductances,
+    what drives currents, force.
     """
     values, places, pushes, poles, axes, resistance, leakage, (flows, acts), _ = plant
     n = voltage.size
@@ -380,47 +380,27 @@ def rate(
         into[places[k, 0]] += values[k] * x[places[k, 1]]
     room[:] = 0.0
     for j in range(n):
-        room[j, j] = leakage[j]
-        room[j, n] = voltage[j] - resistance[j] * x[flows + j]
-        room[j, n + 1] = force[j]
+        room[j, 0] = leakage[j]
+        room[j, 1] = voltage[j] - resistance[j] * x[flows + j]
+        room[j, 2] = force[j]
     for p in range(poles.shape[0]):
-        k, gap, current, sigma, d1, w1, d2, w2 = poles[p]
-        a, b = axes[p, 0], axes[p, 1]
-        gap -= d1 * motion[a]
-        acting = current + w1 * x[acts + a]
-        current += w1 * x[flows + a]
-        closing = d1 * moving[a]
-        if b >= 0:
-            gap -= d2 * motion[b]
-            acting += w2 * x[acts + b]
-            current += w2 * x[flows + b]
-            closing += d2 * moving[b]
+        k, gap, current, sigma, side = poles[p]
+        a = axes[p]
+        gap -= side * motion[a]
+        acting = current + side * x[acts + a]
+        current += side * x[flows + a]
+        closing = side * moving[a]
         if not gap > 0.0:
             return False
         r = math.sqrt(1.0 + sigma * current * current)
         pull = k / (gap * gap) * acting * acting / (1.0 + math.sqrt(1.0 + sigma * acting * acting))
         motional, own = k / (gap * gap) * current / r * closing, k / gap / (r * r * r)
-        room[a, n + 1] += d1 * pull
-        room[a, n] -= w1 * motional
-        room[a, a] += own * w1 * w1
-        if b >= 0:
-            room[b, n + 1] += d2 * pull
-            room[b, n] -= w2 * motional
-            room[b, b] += own * w2 * w2
-            room[a, b] += own * w1 * w2
-            room[b, a] += own * w1 * w2
-    multiply(pushes, room[:, n + 1], into)
-    for a in range(n):  # inductances are symmetric and positive: no pivots are sought
-        for b in range(a + 1, n):
-            if room[b, a] != 0.0:
-                share = room[b, a] / room[a, a]
-                for c in range(a, n + 1):
-                    room[b, c] -= share * room[a, c]
-    for a in range(n - 1, -1, -1):
-        for c in range(a + 1, n):
-            room[a, n] -= room[a, c] * room[c, n]
-        room[a, n] /= room[a, a]
-        into[flows + a] = room[a, n]
+        room[a, 2] += side * pull
+        room[a, 1] -= side * motional
+        room[a, 0] += own
+    multiply(pushes, room[:, 2], into)
+    for a in range(n):
+        into[flows + a] = room[a, 1] / room[a, 0]
     return True
 
 
@@ -439,7 +419,7 @@ def advance_poles(
     fraction, period, steps = plant[8]
     n, n_coordinates = magnets.shape
     at, total, slope = np.empty(x.size), np.empty(x.size), np.empty(x.size)
-    motion, moving, voltage, room = np.empty(n), np.empty(n), np.empty(n), np.empty((n, n + 2))
+    motion, moving, voltage, room = np.empty(n), np.empty(n), np.empty(n), np.empty((n, 3))
     touched = False
     for part in range(2):
         length = period * (fraction if part == 0 else 1.0 - fraction)

@@ -48,14 +48,13 @@ _STRETCH = 200  # samples at one speed at most
 _PHASE = 1e-4  # rad by which the angle may leave that of a changing speed inside a stretch
 _CREEP = 1e-6  # rad/s
 _NODE = 20.0  # rad/s between speeds with exact matrices
-_SAME = 1e-3  # how well numbers of an axial axis have to agree with those of the cones
 
 
 class Poles(NamedTuple):
     """Pole pairs of a rotor, as the compiled loop takes them."""
 
-    numbers: Array  # (n_poles, 8): k, gap, bias, sigma; direction and winding on the first axis and on the second
-    axes: NDArray[np.int64]  # (n_poles, 2): first axis, second or -1
+    numbers: Array  # (n_poles, 5): k, gap, bias, sigma, side
+    axes: NDArray[np.int64]  # (n_poles,)
     leakage: Array  # (n_axes,), H
 
 
@@ -64,11 +63,8 @@ def poles_of(rig: Rig, rotor: RotorModel, theta: Mapping[str, float]) -> Poles:
     gap, or no magnet can have these.
 
     A pair with gap d and coil current j has W' = k h(j)/d, h = j^2/(1 + sqrt(1 + sigma j^2)) (thesis eq. 1.9 for sigma
-    = 0; `physics.coenergy_law`); the sum of all is one co-energy. Two opposed pairs at gap s, bias i0, that the axis
-    meets at an angle with the cosine c have k_i = 2 c k h'(i0)/s^2, k_x = -4 c^2 k h(i0)/s^3, L = 2 k h''(i0)/s +
-    leakage, from which k, i0 and leakage follow. Conical faces have c = cos(cone) and act with sin(cone) along the
-    shaft: the axial current adds half of itself to every coil of the bearing that pulls to +z and takes as much from
-    those of the other.
+    = 0; `physics.coenergy_law`). Two opposed pairs at gap s, bias i0, have k_i = 2 k h'(i0)/s^2, k_x = -4 k h(i0)/s^3,
+    L = 2 k h''(i0)/s + leakage, from which k, i0 and leakage follow.
     """
     magnet, where = rig.magnet, f"rig {rig.name!r}"
     gap = None if magnet is None else magnet.known("s")
@@ -81,25 +77,12 @@ def poles_of(rig: Rig, rotor: RotorModel, theta: Mapping[str, float]) -> Poles:
         raise RigError(f"{where}: an axis is driven by its current; nonlinear magnets need voltages. Omit nonlinear")
     sigma = magnet.known("sigma")
     saturation, s = 0.0 if sigma is None or sigma.value is None else sigma.value, gap.value
-    radial = [j for j, (_, plane) in enumerate(rotor.placed) if plane < 2]
-    axial = [j for j, (_, plane) in enumerate(rotor.placed) if plane == 2]
-    ends = [b.name for b in rotor.bearings if not b.axial]
-    if magnet.cone and (len(axial) != 1 or len(ends) != 2):
-        raise RigError(f"{where}: magnet.cone needs two radial bearings and an axial one. Remove it, or add them")
-    rows, axes = list[list[float]](), list[tuple[int, int]]()
-    leakage = np.array([theta[f"{axis}.L"] for axis in rotor.axes])
-    for j in radial if magnet.cone else range(len(rotor.axes)):
-        cosine, sine = math.cos(magnet.cone), math.sin(magnet.cone)
-        k, bias = _strength(rotor.axes[j], theta, s, saturation, cosine, where)
-        pull = 1.0 if ends[-1:] == [rotor.placed[j][0].name] else -1.0  # of its stator along the shaft
-        along = (pull * sine, 0.5 * pull) if magnet.cone else (0.0, 0.0)
-        for side in (1.0, -1.0):
-            rows.append([k, s, bias, saturation, side * cosine, side, *along])
-            axes.append((j, axial[0] if magnet.cone else -1))
-    poles = Poles(np.array(rows), np.array(axes, dtype=np.int64), leakage)
-    _take_own(poles)
-    if magnet.cone:
-        _check_axial(poles, rotor.axes[axial[0]], axial[0], theta, where)
+    pairs = [_strength(axis, theta, s, saturation, where) for axis in rotor.axes]
+    rows = [[k, s, bias, saturation, side] for k, bias in pairs for side in (1.0, -1.0)]
+    strength, at_rest = np.array(pairs).T
+    own = strength / s * (1.0 + saturation * at_rest**2) ** -1.5  # inductance of each of two
+    leakage = np.array([theta[f"{axis}.L"] for axis in rotor.axes]) - own - own
+    poles = Poles(np.array(rows), np.repeat(np.arange(len(pairs)), 2), leakage)
     short = [rotor.axes[j] for j in range(leakage.size) if leakage[j] < -1e-9 * theta[f"{rotor.axes[j]}.L"]]
     if short:
         raise RigError(
@@ -109,47 +92,19 @@ def poles_of(rig: Rig, rotor: RotorModel, theta: Mapping[str, float]) -> Poles:
     return poles
 
 
-def _strength(
-    axis: str, theta: Mapping[str, float], s: float, sigma: float, cosine: float, where: str
-) -> tuple[float, float]:
+def _strength(axis: str, theta: Mapping[str, float], s: float, sigma: float, where: str) -> tuple[float, float]:
     """Return strength and bias of the pairs of an axis."""
     k_i, k_x = theta[f"{axis}.k_i"], theta[f"{axis}.k_x"]
     if not (k_i > 0.0 > k_x):
         raise RigError(
             f"{where}: {axis} has k_i {k_i:g} N/A and k_x {k_x:g} N/m; a magnet with bias has k_i > 0 > k_x. Correct it"
         )
-    part = -s * k_x / (2.0 * cosine * k_i)  # h/h' = i0 r/(1 + r)
+    part = -s * k_x / (2.0 * k_i)  # h/h' = i0 r/(1 + r)
     bias = 2.0 * part
     for _ in range(100):
         r = math.sqrt(1.0 + sigma * bias**2)
         bias = part * (1.0 + r) / r
-    return k_i * s**2 * math.sqrt(1.0 + sigma * bias**2) / (2.0 * cosine * bias), bias
-
-
-def _take_own(poles: Poles) -> None:
-    """Leave of the inductances what is not that of the poles."""
-    k, s, bias, sigma, _, winding, _, second = poles.numbers.T
-    own = k / s * (1.0 + sigma * bias**2) ** -1.5
-    np.subtract.at(poles.leakage, poles.axes[:, 0], own * winding**2)
-    coupled = poles.axes[:, 1] >= 0
-    np.subtract.at(poles.leakage, poles.axes[coupled, 1], (own * second**2)[coupled])
-
-
-def _check_axial(poles: Poles, axis: str, j: int, theta: Mapping[str, float], where: str) -> None:
-    """Refuse numbers of the axial axis that are not those of the cones."""
-    k, s, bias, sigma, _, _, along, winding = poles.numbers[poles.axes[:, 1] == j].T
-    r = np.sqrt(1.0 + sigma * bias**2)
-    needed = {
-        "k_i": float(np.sum(k * bias / r * along * winding / s**2)),
-        "k_x": -float(np.sum(2.0 * k * bias**2 / (1.0 + r) * along**2 / s**3)),
-    }
-    for name, value in needed.items():
-        stated = theta[f"{axis}.{name}"]
-        if abs(stated - value) > _SAME * abs(value):
-            raise RigError(
-                f"{where}: {axis}.{name} is {stated:g}; with this cone the radial magnets make it {value:.6g}. Correct "
-                "it, or magnet.cone"
-            )
+    return k_i * s**2 * math.sqrt(1.0 + sigma * bias**2) / (2.0 * bias), bias
 
 
 _MOST_MODES = 12  # of a drawing that are looked at
