@@ -38,27 +38,17 @@ def turning():
 @pytest.mark.parametrize("filters", [0, 1])
 def test_equal_gains_are_the_decentralised_loop_in_every_form(turning, form, filters):
     rig, plant = turning
-    sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, plant.theta, form), filters)
+    sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, form), filters)
     law = sets.law(sets.at(rig.loop, (2500.0,) * filters))
     f = np.geomspace(0.5, 0.49 * plant.rate_hz, 40)
     same, found = (controller_of_loop(x, plant.model, plant.rate_hz).response(f)[0] for x in (rig.loop, Loop(law=law)))
     np.testing.assert_allclose(found, same, atol=1e-12 * np.abs(same).max())
 
 
-def test_parallel_gains_push_without_tilting(turning):
-    _, plant = turning
-    form = form_of(plant.model, {**plant.theta, "z_cg": 0.08}, "tilt")
-    assert form.names == ("parallel", "tilt", "axial")
-    np.testing.assert_allclose(sum(form.share(k) for k in range(3)), np.eye(5), atol=1e-14)
-    levers = np.array([plant.theta[f"{b.name}.z"] - 0.08 for b, plane in plant.model.placed if plane == 0])
-    push = form.transform[0][[j for j, (_, plane) in enumerate(plant.model.placed) if plane == 0]]
-    assert push @ levers == pytest.approx(0.0, abs=1e-15)
-
-
 def test_slopes_of_rotors_are_exact(turning):
     rig, plant = turning
     plants = [d.plant for d in draw_plants(plant, rig, 2, seed=3).plants]
-    sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, plant.theta, "tilt"), 1)
+    sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, "bearings"), 1)
     at = sets.at(rig.loop, (2500.0,))
     loops = RotorLoops(plants=plants, noise=noise_of(rig.noise, {})[:2], sets=sets, around=at)
     at = at + 0.05 * np.sin(np.arange(at.size))
@@ -83,7 +73,7 @@ def test_a_tuned_rotor_is_better_on_other_plants_and_speeds(turning):
     plants = [d.plant for d in tuning.plants]
     assert [p.model.speed for p in plants[:3]] == [speeds[1], speeds[1], 0.0]
     before = worst_of([examine(p, rig.loop, noise).figures for p in plants])
-    loop = tune_pid(plants, rig, Goals.of(GOALS, {}, before), silent, form="tilt")
+    loop = tune_pid(plants, rig, Goals.of(GOALS, {}, before), silent, form="bearings")
     found = [[examine(d.plant, x, noise).figures for d in judging.plants] for x in (rig.loop, loop)]
     assert all(f.stable for f in found[1])
     was, now = map(worst_of, found)
@@ -99,9 +89,6 @@ def test_what_an_estimate_does_not_show_is_refused():
         over_speeds(draws, (0.0, 500.0))
     with pytest.raises(EstimationError, match="has 0 bending modes"):
         tune_pid([plant], rig, Goals.of(GOALS, {}, examine(plant, rig.loop, (1e-7, 0.0)).figures), silent, filters=1)
-    one = replace(plant.model, bearings=plant.model.bearings[:1])
-    with pytest.raises(EstimationError, match="tilting takes two bearings"):
-        form_of(one, plant.theta, "tilt")
 
 
 def test_a_rotor_without_a_stop_is_tried_on_linear_magnets():
@@ -120,7 +107,7 @@ def test_a_loop_goes_on_where_it_stopped():
     load = np.zeros((90, len(of.model.axes)))
     load[:, 0] = 1.0
     silence = np.zeros((90, len(of.model.inputs)))
-    law = GainSets.of(rig.loop, of.model, of.rate_hz, form_of(of.model, of.plant.parameters, "axes"))
+    law = GainSets.of(rig.loop, of.model, of.rate_hz, form_of(of.model, "axes"))
     law = law.law(law.at(rig.loop))
     for loop in (rig.loop, Loop(law=law, delay=rig.loop.delay)):
         bench = replace(of, rig=replace(rig, noise=None), loop=loop)

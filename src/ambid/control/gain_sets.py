@@ -1,10 +1,5 @@
-"""PIDs on many axes as one law: the same gains on all, a set a bearing, or sets for parallel and tilting motion.
-
-Coordinates c = T y of an orthogonal T have a set's PID each, and commands go back by T's transpose: equal sets are the
-decentralised loop. The least forces p of a plane that push without tilting, p = R⁺ (1, 0), rows of R ones and levers
-z_b - z_cg, make the parallel coordinate; all else tilts. P = pp'/p'p is symmetric: damping takes energy out wherever
-sensors and magnets stand together. A filter in the position of every set, around a bending mode, is a notch, or turns
-the phase where zeros and poles stand apart:
+"""PIDs on many axes as one law: the same gains on all, or a set a bearing. A filter in the position of every set,
+around a bending mode, is a notch, or turns the phase where zeros and poles stand apart:
 
 F(s) = (w_p/w_z)² (s² + 2 zeta_z w_z s + w_z²)/(s² + 2 zeta_p w_p s + w_p²), s = (2/T) (z - 1)/(z + 1),
 
@@ -14,7 +9,7 @@ in frequencies that are bent beforehand (Franklin, Powell and Workman 1998, sec.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,15 +19,14 @@ from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import FREQUENCIES, SETTLED, closed_loop_of
 from ambid.control.lqg import SampledPlant
-from ambid.errors import EstimationError
 from ambid.physics.law import StateLaw, beside
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Loop
 from ambid.physics.rotor_model import RotorModel
 from ambid.simulation.plant import fed_back
 
-FORMS = ("axes", "bearings", "tilt")
-"""One set for all axes, one a bearing, or parallel and tilting motion apart; the axial bearing then has its own."""
+FORMS = ("axes", "bearings")
+"""One set for all axes, or one a bearing."""
 _WIDE = 0.5  # damping of zeros and poles of a filter that does nothing
 _STEP = 1e-5  # of the logarithms, for slopes of responses and of the law's matrices
 
@@ -79,45 +73,22 @@ class Pid:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Form:
-    """Orthogonal coordinates of the axes, and the set of gains of each."""
+    """Which set of gains each axis has."""
 
-    transform: Array  # (n_axes, n_axes), a row a coordinate
-    sets: tuple[int, ...]  # of each coordinate
+    sets: tuple[int, ...]  # of each axis
     names: tuple[str, ...]  # of the sets
 
     def share(self, k: int) -> Array:
-        """Return the projection of the axes on the coordinates of set `k`, (n_axes, n_axes)."""
-        T = self.transform[np.array(self.sets) == k]
-        return np.asarray(T.T @ T)
+        """Return the projection on the axes of set `k`, (n_axes, n_axes)."""
+        return np.diag(np.array(self.sets) == k).astype(np.float64)
 
 
-def form_of(plant_model: LinearModel, theta: Mapping[str, float], name: str) -> Form:
+def form_of(plant_model: LinearModel, name: str) -> Form:
     """Return a form of `FORMS` for a model."""
     if not isinstance(plant_model, RotorModel) or name == "axes":
-        n = len(plant_model.inputs)
-        return Form(transform=np.eye(n), sets=(0,) * n, names=("all axes",))
-    if name == "bearings":
-        names = tuple(b.name for b in plant_model.bearings)
-        return Form(
-            transform=np.eye(len(plant_model.axes)),
-            sets=tuple(names.index(b.name) for b, _ in plant_model.placed),
-            names=names,
-        )
-    T, sets = np.eye(len(plant_model.axes)), [2] * len(plant_model.axes)
-    for plane in (0, 1):
-        own = [j for j, (_, p) in enumerate(plant_model.placed) if p == plane]
-        if len(own) < 2:
-            raise EstimationError(
-                f"{len(own)} axes hold plane {'xy'[plane]}; tilting takes two bearings. Give another form of gains"
-            )
-        levers = np.array([theta[f"{plant_model.placed[j][0].name}.z"] - theta["z_cg"] for j in own])
-        p = np.linalg.pinv(np.vstack([np.ones(len(own)), levers]))[:, 0]
-        turn = np.linalg.svd(p[None])[2]
-        T[np.ix_(own, own)] = turn * np.where(turn @ np.ones(len(own)) < 0.0, -1.0, 1.0)[:, None]
-        for k, j in enumerate(own):
-            sets[j] = int(k > 0)
-    names = ("parallel", "tilt", *(["axial"] if 2 in sets else []))
-    return Form(transform=T, sets=tuple(sets), names=names)
+        return Form(sets=(0,) * len(plant_model.inputs), names=("all axes",))
+    names = tuple(b.name for b in plant_model.bearings)
+    return Form(sets=tuple(names.index(b.name) for b, _ in plant_model.placed), names=names)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,25 +139,16 @@ class GainSets:
     def law(self, at: Array) -> StateLaw:
         """Return the law over all axes."""
         gains, filters = self.parts(at)
-        T, rate = self.form.transform, 1.0 / self.pid.period
-        ends = np.cumsum([0, *(1 + c for c in self.current)])
-        position, current = ends[:-1], ends[:-1] + 1
-        laws, rows = [], []
-        for c, k in enumerate(self.form.sets):
-            axes = np.flatnonzero(T[c])
-            with_current = all(self.current[j] for j in axes)
+        laws = []
+        for k, with_current in zip(self.form.sets, self.current, strict=True):
             loop = self.pid.loop(gains[k], Loop())
-            law = replace(loop, kc=0.0).as_law(rate, current=False)
+            law = replace(loop, kc=0.0).as_law(1.0 / self.pid.period, current=False)
             for one in filters:
                 law = _filtered(law, one)
-            row = np.zeros((1 + with_current, ends[-1]))
-            row[0, position[axes]] = T[c, axes]
             if with_current:
-                row[1, current[axes]] = T[c, axes]
                 law = replace(law, B=np.pad(law.B, ((0, 0), (0, 1))), D=np.append(law.D, [[-loop.kc]], axis=1))
             laws.append(law)
-            rows.append(row)
-        return beside(laws).through(np.vstack(rows), T.T)
+        return beside(laws)
 
     def current_gain(self, at: Array, k: int) -> float:
         """Return kc of set `k`."""

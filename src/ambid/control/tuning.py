@@ -314,7 +314,7 @@ class _Rotors:
                 "modes"
             )
         around = tuple(own[:filters])
-        pid = GainSets.of(rig.loop, first.model, first.rate_hz, form_of(first.model, first.theta, form), filters)
+        pid = GainSets.of(rig.loop, first.model, first.rate_hz, form_of(first.model, form), filters)
         one = pid.pid.at(rig.loop)
         gains = np.tile(bounds_of(rig, pid.pid, one), (len(pid.form.names), 1))
         near = [[[math.log(w) - _AWAY, math.log(w) + _AWAY]] * 2 + [list(np.log(_DAMPING))] * 2 for w in around]

@@ -115,8 +115,8 @@ def design_controller(
         Largest values by the same names, in dB, m/N, V rms and s; default: what the present loop has.
     spread : Mapping[str, float], optional
         How far plants are drawn, by the names of `ambid.control.drawn.Spread`; 0 switches a source off.
-    form : {"axes", "bearings", "tilt"}
-        Gains of a rotor's PID: the same on all axes, a set a bearing, or sets for parallel and tilting motion.
+    form : {"axes", "bearings"}
+        Gains of a rotor's PID: the same on all axes, or a set a bearing.
     filters : int
         Around so many of a rotor's lowest bending modes the PID has a filter each, a notch or a phase lead.
     speeds_rpm : (float, float), optional

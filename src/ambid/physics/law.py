@@ -1,4 +1,4 @@
-"""A controller as a discrete-time state-space law, for what a PID cannot say: LQG, notches, tilting motion."""
+"""A controller as a discrete-time state-space law, for what a PID cannot say: LQG, notches."""
 
 from __future__ import annotations
 
@@ -79,11 +79,6 @@ class StateLaw:
         """Return the law whose signals are first multiplied by `inputs`, (n_y,), and its commands last by `output`."""
         scaled = self.scaled(inputs)
         return replace(scaled, C=self.C * output, D=scaled.D * output, G=self.windup / output)
-
-    def through(self, rows: Array, columns: Array) -> StateLaw:
-        """Return the law that sees `rows` y, (n_seen, n_y), and commands `columns` w, (n_u, n_given)."""
-        given = np.linalg.pinv(columns)
-        return replace(self, B=self.B @ rows, C=columns @ self.C, D=columns @ self.D @ rows, G=self.windup @ given)
 
     def check(self, n_inputs: int, n_fed_back: int, rate_hz: float) -> None:
         """Refuse a plant or a rate that the law is not for."""

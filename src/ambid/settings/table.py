@@ -59,7 +59,7 @@ SETTINGS = (
         "repeatable.", many=True),
     Setting("folder", "path", "[FOLDER]", "Folder whose files are shown.", argument=True, default="."),
     Setting("force", "switch", "", "Overwrite an existing record; go on with a loop that is predicted unstable."),
-    Setting("form", "text", "NAME", "Gains of a rotor's PID: axes (one set), bearings, or tilt (and parallel).",
+    Setting("form", "text", "NAME", "Gains of a rotor's PID: axes (one set) or bearings.",
         default="axes"),
     Setting("from_s", "number", "S", "Start time in the record, in s."),
     Setting("gaps", "text", "", "Missing values: refuse them, interpolate, or use the longest part without any.",
