@@ -41,14 +41,6 @@ def test_a_refusal_leaves_an_older_track_as_it_was(ambid, bench, start, words, s
     assert (bench / "track.jsonl").read_text(encoding="utf-8") == OLDER
 
 
-def test_a_flag_behind_the_end_of_the_record_is_told(ambid, start):
-    found = ambid("track", "record.csv", *start, "--flag", "99:hold", "--flag", "0.05:hold")
-    assert found.code == 0
-    assert found.err.splitlines() == [
-        "ambid: --flag 99:hold was not reached: the last line is at 0.15 s. Give a time in the record"
-    ]
-
-
 def test_a_record_without_one_sound_sample_is_no_success(ambid, bench, start, record_text):
     values = columns(record_text)
     values[:, 2] = np.nan

@@ -91,27 +91,6 @@ def test_samples_that_were_lost_are_events_of_their_kind(here, ambid):
     assert np.diff([line["t"] for line in lines]) == pytest.approx(0.01, abs=1e-6)
 
 
-def test_flags_on_the_command_line(here, ambid):
-    words = (
-        "--start",
-        "e.json",
-        "--json",
-        "f.jsonl",
-        "--flag",
-        "1.5:hold",
-        "--flag",
-        "2.0:accept",
-        "--flag",
-        "2.1:revert",
-    )
-    assert ambid("track", "change.csv", *words).code == 0
-    _, *lines, _ = lines_of(here / "f.jsonl")
-    k_i = {round(x["t"], 2): x["parameters"]["k_i"]["value"] for x in lines}
-    assert {x["state"] for x in lines if x["t"] > 1.505} == {"hold"}
-    assert k_i[1.51] == k_i[1.99] == k_i[2.2]
-    assert k_i[2.05] == pytest.approx(0.85 * 55.73352, rel=0.02)
-
-
 def test_starts_that_do_not_fit_are_refused_on_one_line(here, ambid):
     whole = json.loads((here / "e.json").read_text())
     (here / "coil.json").write_text(json.dumps({**whole, "model": "coil"}))

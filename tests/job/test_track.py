@@ -223,9 +223,9 @@ def test_flags_and_stops_from_the_outside(steady):
 
     def on_line(line):
         seen.append(line.state)
-        return ("hold",) if len(seen) == 10 else ()
+        return ("hold",) if len(seen) == 10 else ("track",) if line.t > 2.0 else ()
 
-    found = track(record, on_line=on_line, flags=((2.0, "track"),), keep=False)
+    found = track(record, on_line=on_line, keep=False)
     assert len(found.lines) == 1  # the last one
     n = round((2.0 - START_S * 2.5 / 3) * 100)
     assert set(seen[10 : n - 2]) == {"hold"}
@@ -270,8 +270,7 @@ def test_a_change_is_followed_at_any_limit_and_interval():
 SETTINGS = [
     {"every_s": float("nan")}, {"every_s": float("inf")}, {"every_s": 0.0}, {"every_s": -1.0},
     {"limit": float("inf")}, {"limit": float("nan")}, {"limit": 0.0}, {"memory": "x"}, {"memory": float("nan")},
-    {"memory": 1e300}, {"memory": 0.0}, {"pace": "x"}, {"flags": [(float("nan"), "hold")]},
-    {"flags": [(0.1, "holt")]}, {"flags": [("x", "hold")]}, {"flags": "hold"}, {"start": -0.1}, {"rate_hz": 100.0},
+    {"memory": 1e300}, {"memory": 0.0}, {"pace": "x"}, {"start": -0.1}, {"rate_hz": 100.0},
     {"rig": 3}, {"start": [3]}, {"from_s": "x"},
 ]  # fmt: skip
 

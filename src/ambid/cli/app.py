@@ -71,7 +71,10 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "acquire": {"no-live": "", "quiet": ""},
-    "track": {"reference": "", "start-seconds": "--start S", "no-live": "", "quiet": ""},
+    "track": {
+        "flag": "'ambid console', whose Live page plays a record too", "reference": "",
+        "start-seconds": "--start S", "no-live": "", "quiet": "",
+    },
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
 }  # fmt: skip
 

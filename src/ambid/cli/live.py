@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ambid.report.track_figures import TrackHistory
     from ambid.tracking.lines_file import LiveState
 
-Flag = Literal["track", "hold", "accept", "revert"]
 
 _TELL_S = 0.1  # how often at most it is told where the run is
 _QUIET_S = 1.0  # a start that takes less shows nothing
@@ -96,13 +95,12 @@ class Follower:
         *,
         drawn: Path | None = None,
         strict: bool = False,
-        flags: Sequence[tuple[float, Flag]] = (),
         store: Callable[[Track], object] = repr,
     ) -> None:
-        """Print the track, say what was interrupted or not reached, and end with the exit code.
+        """Print the track, say what was interrupted, and end with the exit code.
 
-        `drawn`: the figure of the track; `strict`: whether all but a usable one ends with exit code 3; `flags`: as
-        given; `store`: takes a track that was not interrupted.
+        `drawn`: the figure of the track; `strict`: whether all but a usable one ends with exit code 3; `store`: takes a
+        track that was not interrupted.
         """
         if self.track is None:
             if self.code:
@@ -119,10 +117,6 @@ class Follower:
             holds = f"; {' and '.join(names)} hold{'s' if len(names) == 1 else ''} the track so far" if names else ""
             print(f"ambid: interrupted at {end_s:.4g} s of record{holds}", file=sys.stderr)
             raise typer.Exit(self.code)
-        for t, flag in flags:
-            if t > end_s:
-                said = f"the last line is at {end_s:.6g} s. Give a time in the record"
-                print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
         store(self.track)
         end(failed=strict and not self.track.passed)
 

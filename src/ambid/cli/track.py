@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,11 +11,10 @@ import typer
 from ambid.cli.interrupts import INTERRUPTED
 from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs, json_path, keeping
-from ambid.errors import AmbidError, nearest
+from ambid.errors import AmbidError
 from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
-    from ambid.cli.live import Flag
     from ambid.recursive.lines import TrackHeader
 
 
@@ -31,9 +29,8 @@ def command(v: Values) -> None:
     from ambid.job.tracking import track
     from ambid.rig import load_rig
 
-    times = _flags(v.flags)
     start = Path(x) if isinstance(x := _number(v.start), str) else x
-    how = v.only("every_s limit pace rate_hz") | {"start": start, "memory": _number(v.memory), "flags": times}
+    how = v.only("every_s limit pace rate_hz") | {"start": start, "memory": _number(v.memory)}
     check_settings(how)
     own = {name: x for name, x in v.only("input output orders open_loop step").items() if x}
     if v.method == "rpem" and own:
@@ -64,7 +61,7 @@ def command(v: Values) -> None:
                     kept = f"; {follower.path} holds the track" if follower.path else ""
                     print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
                     raise typer.Exit(INTERRUPTED) from None
-        follower.finish(outputs, drawn=v.plot, strict=v.strict, flags=times, store=store)
+        follower.finish(outputs, drawn=v.plot, strict=v.strict, store=store)
 
 
 def _check_interval(every: float, rate_hz: float) -> None:
@@ -81,25 +78,3 @@ def _number(text: str | None) -> Any:
         return None if text is None else float(text)
     except ValueError:
         return text
-
-
-def _flags(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
-    """Read ``--flag``, each a time in s, a colon and a flag, in the order of their times."""
-    from ambid.job.following import FLAGS
-
-    found: list[tuple[float, Flag]] = []
-    for text in texts or []:
-        time, colon, name = text.partition(":")
-        flag = next((f for f in FLAGS if f == name), None)
-        if colon and flag is None:
-            raise AmbidError(
-                f"--flag {text}: flag {name!r} is unknown; known: {', '.join(FLAGS)}{nearest(name, FLAGS)}"
-            )
-        try:
-            t = float(time)
-        except ValueError:
-            t = math.nan
-        if flag is None or not math.isfinite(t):
-            raise AmbidError(f"--flag {text} is not of the form T:FLAG, such as 12.5:hold. Correct it")
-        found.append((t, flag))
-    return tuple(sorted(found, key=lambda f: f[0]))

@@ -12,20 +12,19 @@ from pathlib import Path
 from typing import Any, Literal, TypedDict
 
 from ambid.blackbox.data import Orders
-from ambid.errors import AmbidError, EstimationError, nearest
+from ambid.errors import AmbidError, EstimationError
 from ambid.job.data import Names
 from ambid.record import Record, read_record
 from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine
 from ambid.report.track_figures import TrackHistory
 from ambid.settings.caller import setting
+from ambid.tracking.gate import Flag
 from ambid.tracking.lines_file import Tally
 
-Flag = Literal["track", "hold", "accept", "revert"]
 Memory = float | Literal["auto", "all"]
 Pace = Literal["fastest", "real-time"]
 OnLine = Callable[[TrackLine], Sequence[Flag] | None]
 
-FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
 _PACES = ("fastest", "real-time")
 _SHORTEST_S, _LONGEST_S = 1e-3, 1e9  # of a memory: below a block, and beyond any record
 
@@ -38,7 +37,6 @@ class Following:
     limit: float = 1.5  # acceptable model error, in multiples of that at identification
     memory: Memory = "auto"  # how long data count: a time constant in s, found from the data, or for ever
     pace: Pace = "fastest"  # replay as fast as possible, or as the record was taken
-    flags: Sequence[tuple[float, Flag]] = ()  # what an operator sets and when, s of record
     on_header: Callable[[TrackHeader], None] | None = None  # called once before the first line
     on_line: OnLine | None = None  # called with each line; flags that it returns are set
     keep: bool = True  # keep all lines for the result; else the last one alone, and memory stays constant
@@ -84,7 +82,6 @@ class FollowingWords(TypedDict, total=False):
     limit: float
     memory: Memory
     pace: Pace
-    flags: Sequence[tuple[float, Flag]]
     on_header: Callable[[TrackHeader], None] | None
     on_line: OnLine | None
     keep: bool
@@ -123,8 +120,6 @@ def check_settings(said: Mapping[str, Any]) -> None:
     pace = said.get("pace", _PACES[0])
     if pace not in _PACES:
         raise EstimationError(f"{setting('pace')} is {pace!r}; known: {', '.join(_PACES)}. Correct it")
-    for flag in said.get("flags", ()):
-        _check_flag(flag)
 
 
 def _positive(name: str, x: object, *, other: str = "") -> None:
@@ -139,18 +134,6 @@ def _number(x: object) -> float:
         return math.nan if isinstance(x, (str, bool)) else float(x)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return math.nan
-
-
-def _check_flag(flag: object) -> None:
-    """Refuse a flag that is not a pair of a finite time and a known name."""
-    if isinstance(flag, str) or not isinstance(flag, Sequence) or len(flag) != 2:
-        raise EstimationError(f"flag {_short(flag)} is not a pair of a time in s and a name, such as (12.5, 'hold')")
-    t, name = flag
-    if isinstance(t, (str, bool)) or not isinstance(t, (int, float)) or not math.isfinite(t):
-        raise EstimationError(f"flag {_short(flag)}: its time is {_short(t)}; it must be finite, in s. Correct it")
-    if name not in FLAGS:
-        near = nearest(name, FLAGS) if isinstance(name, str) else ""
-        raise EstimationError(f"flag {_short(flag)}: {_short(name)} is unknown; known: {', '.join(FLAGS)}.{near}")
 
 
 def _short(x: object) -> str:

@@ -19,7 +19,6 @@ from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Names, Reading, RigSource, Source, known_rig
 from ambid.job.following import (
     EstimatorWords,
-    Flag,
     Followed,
     Following,
     FollowingWords,
@@ -37,6 +36,7 @@ from ambid.settings.calls import of_job
 from ambid.tracking.blocks import Block, Frame, Stretch
 from ambid.tracking.engine import run
 from ambid.tracking.evidence import Samples
+from ambid.tracking.gate import Flag
 from ambid.tracking.guard import ABSURD, StreamGuard
 from ambid.tracking.lines_file import Tally
 from ambid.tracking.numbers import Forcing
@@ -61,7 +61,6 @@ def track(
     limit: float = 1.5,
     memory: Memory = "auto",
     pace: Pace = "fastest",
-    flags: Sequence[tuple[float, Flag]] = (),
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
@@ -103,12 +102,11 @@ def track(
         Memory of the estimator: a time constant in s, found from the data ("auto"), or infinite ("all").
     pace : {"fastest", "real-time"}, optional
         Replay as fast as possible, or as the record was taken.
-    flags : sequence of (float, str), optional
-        Flags that an operator sets, with their times in s of record: "track", "hold", "accept" or "revert".
     from_s, to_s, rate_hz, units, layout : optional
         As `ambid.identify`.
     on_header, on_line : callable, optional
-        Called once before the first line, and with each line; flags that `on_line` returns are set.
+        Called once before the first line, and with each line; flags of an operator that `on_line` returns are set:
+        "track", "hold", "accept", "revert".
     keep : bool, optional
         Keep all lines for the result; without, the last one only, and memory stays constant.
     tick : callable, optional
@@ -125,7 +123,7 @@ def track(
         If start or settings make no sense, or nothing can be identified to start from.
     """
     following = FollowingWords(
-        every_s=every_s, limit=limit, memory=memory, pace=pace, flags=flags, on_header=on_header, on_line=on_line,
+        every_s=every_s, limit=limit, memory=memory, pace=pace, on_header=on_header, on_line=on_line,
         keep=keep,
     )  # fmt: skip
     check_settings({**following, "start": start, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz})
@@ -141,7 +139,6 @@ def track(
             {
                 "method": method != "rpem" and method,
                 "pace": how.pace != "fastest" and how.pace,
-                "flags": how.flags,
             },
             "{} is for one axis; a rotor is tracked from one period to the next. Omit it",
         )
@@ -151,8 +148,8 @@ def track(
     if method != "rpem" or any(settings.values()):
         from ambid.job.track_estimator import track_estimator
 
-        if how.pace != "fastest" or how.flags:
-            raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Omit them")
+        if how.pace != "fastest":
+            raise EstimationError(f"method {method} has no supervisor: it takes no pace. Omit it")
         result = track_estimator(record, bench, method, start, part, how, settings)
         return replace(result, used=Followed(record=record, rate_hz=rate_hz))
     source = rows_of(record, bench, **part)
@@ -182,7 +179,7 @@ def follow(
         return take(line)
 
     reporter = Reporter(
-        supervisor, every_s=how.every_s, on_line=counted, flags=how.flags, t0=source.t0, first=first,
+        supervisor, every_s=how.every_s, on_line=counted, t0=source.t0, first=first,
     )  # fmt: skip
     samples = None if live else int(np.count_nonzero(source.replay.numbers >= first))
     top = header(

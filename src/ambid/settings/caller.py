@@ -23,7 +23,7 @@ _words: Mapping[str, str] = {}  # what the caller calls some settings, by name
 
 # Names whose flag is not made by leaving out the unit.
 _FLAGS = {
-    "closed": "loop", "flags": "flag", "goals": "goal", "limits": "limit",
+    "closed": "loop", "goals": "goal", "limits": "limit",
     "speeds_rpm": "speeds", "identify_nonlinear": "nonlinear",
 }  # fmt: skip
 _IN_PYTHON = ("units", "samples", "path")  # what the command has no option for

@@ -59,7 +59,7 @@ _JOBS = (
         port={"help": "Port of the page; 0: any that is free.", "default": 0, "most": 65535, "kind": "whole",
         "metavar": "N", "required": False}),
     declare("track", "record rig method input output orders open_loop step start every_s limit memory pace "
-        "flags from_s to_s rate_hz layout json plot report ledger bearing taken_at strict",
+        "from_s to_s rate_hz layout json plot report ledger bearing taken_at strict",
         method={"help": "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from @input to "
         "@output by rls, lms, nlms, or a recursive arx, armax, oe, bj, ...", "choices": (), "default": "rpem",
         "metavar": "NAME"},

@@ -55,8 +55,6 @@ SETTINGS = (
     Setting("feedthrough", "switch", "", "With @state_space: include a direct path from input to output (D)."),
     Setting("filters", "whole", "N", "Filters around a rotor's lowest bending modes.", least=0, default=0),
     Setting("fix", "text", "NAME=NUMBER", "Fix a coefficient; repeatable.", many=True),
-    Setting("flags", "text", "T:hold", "Set a flag at a time of the record: track, hold, accept or revert; "
-        "repeatable.", many=True),
     Setting("folder", "path", "[FOLDER]", "Folder whose files are shown.", argument=True, default="."),
     Setting("force", "switch", "", "Overwrite an existing record; go on with a loop that is predicted unstable."),
     Setting("form", "text", "NAME", "Gains of a rotor's PID: axes (one set) or bearings.",
