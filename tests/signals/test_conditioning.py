@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import RecordError
-from ambid.signals import cut, remove_trend, replace_samples
+from ambid.signals import cut, remove_trend, replace_samples, resample
 
 RATE = 1000.0
 T = np.arange(4000) / RATE
@@ -84,3 +84,31 @@ def test_replacing_nothing_adds_no_history(make):
 def test_an_unknown_channel_is_named(make):
     with pytest.raises(RecordError, match="'z'"):
         remove_trend(make(RATE, x=T), "z")
+
+
+@pytest.mark.parametrize(("rate", "n"), [(500.0, 2000), (250.0, 1000), (400.0, 1600)])
+def test_resampling_keeps_the_band_in_time_and_removes_what_would_alias(make, rate, n):
+    r = resample(make(RATE, x=sine(20) + sine(450)), rate)
+    assert (r.rate_hz, r.n_samples) == (rate, n)
+    middle = slice(n // 8, -n // 8)
+    assert np.max(np.abs(r["x"] - np.sin(2 * np.pi * 20 * r.time_s))[middle]) < 0.01
+    assert r.history[0].settings["to_hz"] == rate
+
+
+def test_resampling_keeps_a_constant(make):
+    np.testing.assert_allclose(resample(make(RATE, x=np.full(3000, 7.0)), 300.0)["x"], 7.0, rtol=1e-12)
+
+
+def test_a_record_that_is_asked_to_resample_sends_there(make):
+    with pytest.raises(AttributeError, match=r"Write ambid\.signals\.resample"):
+        _ = make(RATE, x=T).resample
+
+
+def test_upsampling_is_refused(make):
+    with pytest.raises(RecordError, match="adds samples but no information"):
+        resample(make(RATE, x=sine(20)), 2000.0)
+
+
+def test_resampling_to_an_irrational_ratio_is_refused(make):
+    with pytest.raises(RecordError, match="fraction"):
+        resample(make(RATE, x=sine(20)), 1000.0 / np.pi)

@@ -53,7 +53,8 @@ _PART = "'ambid validate RESULT RECORD' with --from and --to"
 # Words of the releases before, by job: what each is now; nothing where it is gone.
 _FORMER: Mapping[str, Mapping[str, str]] = {
     "fit": {
-        "settings": "--orders", "validate-from": _PART, "validate-to": _PART, "sensitivity": "",
+        "settings": "--orders", "validate-from": _PART, "validate-to": _PART,
+        "sensitivity": "--json FILE, which has the standard deviations",
         "stabilisation": "'ambid frf RECORD --modes auto --plot FILE.png'",
     },
     "identify": {
@@ -67,12 +68,15 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "export": "", "tables": "", "metrics": "--publish FILE.prom",
         "mqtt": "--json -, which any client of a broker passes on",
     },
-    "design controller": {"method": "--kind", "export": "--law", "judges": "", "schedule": ""},
+    "design controller": {
+        "method": "--kind", "export": "--law", "judges": "",
+        "schedule": "--kind lqg with --speeds, one law for all",
+    },
     "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "acquire": {"no-live": "", "quiet": ""},
     "track": {
-        "flag": "'ambid console', whose Live page plays a record too", "reference": "",
+        "flag": "'ambid console', whose Live page plays a record too", "reference": "--method armax",
         "start-seconds": "--start S", "no-live": "", "quiet": "",
     },
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},

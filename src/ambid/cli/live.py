@@ -148,7 +148,7 @@ class Follower:
         self.state = LiveState(header)
 
     def on_line(self, line: TrackLine) -> None:
-        """Take a line: written, counted and kept; drawing looks at it later."""
+        """Take a line: written, counted, kept for a figure, and told."""
         assert self.state is not None
         if self._writer is not None:
             if not self._writer.begun:

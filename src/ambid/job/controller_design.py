@@ -106,8 +106,8 @@ def design_controller(
     rig : Rig, path, dict or TOML text, optional
         With the present ``[loop]``; default: that of the estimate.
     method : {"pid", "lqg"}
-        "pid": the present structure, tuned; "lqg" and "hinf": a state-space law with integral action by the
-        mean or the worst of noise and disturbances, its weights tuned.
+        "pid": the present structure, tuned; "lqg": a state-space law with integral action by the mean of noise and
+        disturbances, its weights tuned.
     goals : sequence of {"peak", "compliance", "noise", "settling"}
         What is to be small: peak of the sensitivity, displacement by a force, noise of the sensors in the command,
         time in which a force step is settled.

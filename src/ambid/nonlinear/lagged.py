@@ -1,9 +1,9 @@
 """One model for every difference equation whose right side is a function of past signals.
 
 yhat(t) = f(x(t), theta), x past outputs, inputs and innovations (`Regressors`), f a sum of blocks: `Linear`, `Terms`
-(polynomial or rational), `Tanh` (a hidden layer), `Radial` (units about centres). Predictions, free runs and exact
-derivatives D(t) = df/dtheta + sum of (df/dx_k) D(t - k) (`kernels.propagate`) are written once. A family is a subclass
-of `LaggedFunction`; `LaggedModel` adds scaling, units and cloud; `lagged_problem` searches. Scheduled coefficients are
+(polynomial), `Tanh` (a hidden layer), `Radial` (units about centres). Predictions, free runs and exact derivatives
+D(t) = df/dtheta + sum of (df/dx_k) D(t - k) (`kernels.propagate`) are written once. A family is a subclass of
+`LaggedFunction`; `LaggedModel` adds scaling, units and cloud; `lagged_problem` searches. Scheduled coefficients are
 `Terms` with basis functions as inputs. Signals here are scaled; time is axis 0.
 """
 

@@ -32,11 +32,12 @@ PACKAGE: Mapping[str, str] = {
 RECORD: Mapping[str, str] = {
     **dict.fromkeys(("fs", "rate", "SamplingRate"), "rate_hz"), **dict.fromkeys(("dt", "Ts"), "1 / rate_hz"),
     **dict.fromkeys(("time", "t", "SamplingInstants", "index"), "time_s"), "columns": "names",
-    **dict.fromkeys(("iloc", "loc", "head", "tail", "resample", "values", "corr"), "to_dataframe().{0}"),
+    **dict.fromkeys(("iloc", "loc", "head", "tail", "values", "corr"), "to_dataframe().{0}"),
     **dict.fromkeys(("to_csv", "to_hdf", "write"), "save(file)"), "fft": "plot()", "detrend": "ambid.signals",
     **dict.fromkeys(("to_pandas", "copy", "rename", "drop", "describe", "info"), "to_dataframe()"),
     "psd": "ambid.signals", "filter": "scipy.signal.sosfiltfilt(sos, record['name'])", "cut": "record[from_s:to_s]",
     **dict.fromkeys(("u", "InputData", "y", "OutputData"), "record['name']"),
+    "resample": "ambid.signals.resample(record, rate_hz)",
 }  # fmt: skip
 """Of a record; a part of one is ``record[0.5:2.0]``, in seconds."""
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from ambid.record import cut as cut
     from ambid.signals.conditioning import remove_trend as remove_trend
     from ambid.signals.conditioning import replace_samples as replace_samples
+    from ambid.signals.conditioning import resample as resample
     from ambid.signals.delay import find_delay as find_delay
     from ambid.signals.delay import persistent_excitation as persistent_excitation
     from ambid.signals.excitations import AXES_EXCITATIONS as AXES_EXCITATIONS

@@ -1,9 +1,10 @@
-"""Steps on a record before it is used: replace samples, remove a trend."""
+"""Steps on a record before it is used: replace samples, remove a trend, resample."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,3 +148,57 @@ def polynomial_trend(x: Array, degree: int) -> Array:
     coefficients = np.linalg.lstsq(basis, x, rcond=None)[0]
     trend: Array = basis @ coefficients
     return trend
+
+
+def resample(record: Record, rate_hz: float) -> Record:
+    """Lower the sampling rate of the whole record by a rational factor, with an anti-alias filter.
+
+    Polyphase linear-phase FIR (Kaiser window), compensated for its delay. A held input (steps, PRBS) is smeared over
+    the edges by the filter: identify at the measured rate where that matters.
+
+    Parameters
+    ----------
+    record : Record
+    rate_hz : float
+        New rate in Hz; its ratio to the present one must be a fraction with terms up to 1000.
+
+    Returns
+    -------
+    Record, a new one with the step in its history
+
+    Raises
+    ------
+    RecordError
+        If the rate is not positive, higher (that adds samples but no information), or not a rational multiple.
+    """
+    if not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise RecordError(f"resample to {rate_hz} Hz; the rate must be a positive number of Hz. Give another rate")
+    if rate_hz > record.rate_hz:
+        raise RecordError(
+            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz adds samples but no information. Give a lower rate"
+        )
+    ratio = Fraction(rate_hz / record.rate_hz).limit_denominator(1000)
+    if ratio == 0 or ratio.numerator > 1000 or abs(float(ratio) * record.rate_hz / rate_hz - 1.0) > 1e-9:
+        raise RecordError(
+            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz is not a fraction with terms up to 1000. Give "
+            f"{float(ratio) * record.rate_hz:.10g} Hz or another multiple"
+        )
+    if record.n_samples * ratio < 2:
+        raise RecordError(f"resample to {rate_hz:g} Hz leaves less than two samples. Give a higher rate")
+    channels = tuple(replace(c, values=_resampled(finite(record, c.name), ratio)) for c in record.channels)
+    step = Step(name="resample", settings={"from_hz": record.rate_hz, "to_hz": float(rate_hz), "ratio": str(ratio)})
+    return record.with_step(step, channels=channels, rate_hz=float(rate_hz))
+
+
+def _resampled(x: Array, ratio: Fraction) -> Array:
+    """Return samples (ceil(n_samples * ratio),) at a new rate, `ratio` times the old one, by a polyphase anti-alias
+    filter; the first is at the same instant.
+    """
+    from scipy.signal import resample_poly
+
+    # Without the line through its ends the signal starts and ends at 0, as the filter assumes; and the line passes
+    # exactly.
+    slope = (x[-1] - x[0]) / max(x.size - 1, 1)
+    rest = resample_poly(x - (x[0] + slope * np.arange(x.size)), ratio.numerator, ratio.denominator)
+    values: Array = rest + x[0] + slope * np.arange(rest.size) / float(ratio)
+    return values
