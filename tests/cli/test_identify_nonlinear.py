@@ -75,7 +75,7 @@ def test_several_records_to_files_and_table(at, ambid) -> None:
 def test_the_rig_says_what_is_known_and_the_options_change_it(at, ambid) -> None:
     words = ("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--to", "0.7", "--json", "-")
     of_rig = json.loads(ambid(*words, "--report", at / "ball.html").out)
-    assert (at / "ball.html").read_text(encoding="utf-8").count('<div class="picture">') == 5
+    assert (at / "ball.html").read_text(encoding="utf-8").count('<div class="picture">') == 4
     assert of_rig["law"]["gap"] == "hyperbolic"
     assert of_rig["parameters"]["s"]["role"] == of_rig["parameters"]["m"]["role"] == "fixed"
     assert of_rig["delay"]["voltage"]["how"] == "given"

@@ -248,15 +248,25 @@ def test_sound_records_agree(estimate):
 
 
 def test_facts_of_a_record_are_compared_with_the_estimate():
-    """An offset of the voltage lets the means contradict R, unless the rig says that there is one."""
+    """An offset of the voltage lets the means contradict R, unless the rig says that there is one, or the estimate
+    does, and it is of a stage's size.
+    """
     _, told = ball()
     record = package.simulate("levitated-ball", duration=1.0, seed=2, nonlinear=True)
     far = 0.05 * float(record["voltage"].values.mean())
-    moved = replace(
-        record,
-        channels=tuple(replace(c, values=c.values + far) if c.name == "voltage" else c for c in record.channels),
+    moved, farther = (
+        replace(
+            record,
+            channels=tuple(replace(c, values=c.values + x) if c.name == "voltage" else c for c in record.channels),
+        )
+        for x in (far, 4.0 * far)
     )
-    sound, contradicted = (identify_nonlinear(x, told) for x in (record, moved))
+    sound, explained, contradicted = (identify_nonlinear(x, told) for x in (record, moved, farther))
+    check = explained.checks["ohm"]
+    assert (check.passed, explained.verdict.word) == (True, "usable")
+    assert explained["R"].sd > 0.9 * abs(check.size)
+    assert abs(explained["v_offset"].value + far) < 2.0 * explained["v_offset"].sd
+    assert any("only known together" in w for w in explained.warnings)
     assert {"ohm", "belonging", "sampling", "log_runs", "position_size"} <= sound.checks.keys()
     assert sound.verdict.word == "usable"
     check = contradicted.checks["ohm"]

@@ -120,13 +120,16 @@ def test_the_interval_holds_what_gravity_asks_for_and_the_cause_is_named(levitat
 
 
 def test_what_moves_with_a_contradicted_k_i_is_widened_too(tmp_path):
-    """The laboratory's inductance gives k_x = -d2L/dz2 i0^2 / 2; the record's own interval, 1.6 %, is four sd off."""
+    """The laboratory's inductance gives k_x = -d2L/dz2 i0^2 / 2; the record's own interval, 1.6 %, is four sd off.
+
+    What bands of the record move, 24 %, is in the interval too: the residuals are coloured.
+    """
     rig = written(tmp_path, AXIS_RIG.replace('kind = "single"', "off_below = 0.0431"))
     estimate = identify(MAGLEV / "levitate_sine_d.csv", rig, from_s=2.0)
     _, z, i = columns("sine_d").mean(axis=0)
     stiffness = -0.5 * 0.0404 * 158.5**2 * np.exp(-158.5 * z) * i**2
     assert not estimate.checks["gravity_balance"].passed
-    assert abs(estimate["k_x"].value - stiffness) < 2.0 * estimate["k_x"].sd < 0.3 * abs(stiffness)
+    assert abs(estimate["k_x"].value - stiffness) < 2.0 * estimate["k_x"].sd < 0.6 * abs(stiffness)
 
 
 def plain_least_squares(name, cutoff_hz):

@@ -229,7 +229,7 @@ def test_hum_is_named_without_whole_periods(sound: Any) -> None:
     check = ambid.identify(changed(record, bx_current=lambda x: x + hum), rig).checks["lines"]
     assert (check.passed, check.cause, check.alternatives) == (False, "line", ("mode",))
     assert check.size == pytest.approx(50.0, abs=1.2)
-    assert "most in bx_current" in check.detail
+    assert "most in" not in check.detail  # the noise is taken as coloured with it, which spreads it over channels
 
 
 @pytest.mark.parametrize("logs_a", [False, True])

@@ -109,9 +109,11 @@ def _line_check(e: Array, found: PredictorFit, rate_hz: float) -> dict[str, Chec
     if not narrow or whole.size * chi_squared_tail(2 * n_y, 2.0 * float(whole[j])) > _CHANCE:
         return {}
     frequency, channel = float(frequencies[j]), found.model.outputs[int(np.argmax(power[j]))]
+    # a predictor of coloured noise takes part of a line to other channels
+    most = "" if searched_of(found.fit).colours else f", most in {channel}"
     check = Check(
         passed=False, cause="line", size=frequency, alternatives=("mode",),
-        detail=f"a line at {frequency:.4g} Hz stands in the innovations, most in {channel}: hum, motion of the base, a "
+        detail=f"a line at {frequency:.4g} Hz stands in the innovations{most}: hum, motion of the base, a "
         "tone, or a bending mode that the model lacks. Look for it with the excitation off",
     )  # fmt: skip
     return {"lines": check}
