@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.colours import without_colours
 from ambid.estimation.estimate import Check, Continuous, Delay, Estimate, EstimatedParameter, NoiseModel, OutputFit
 from ambid.estimation.likelihood import (
     Fit,
@@ -310,7 +311,7 @@ def estimate_of(
         covariance_method="robust" if robust else "information",
         delay=dict.fromkeys(problem.model.inputs, delay),
         continuous=Continuous.of(problem.model, theta),
-        noise=_noise(fit),
+        noise=_noise(without_colours(fit)),
         operating_point=means,
         fit={
             role: OutputFit(

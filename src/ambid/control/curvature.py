@@ -75,7 +75,8 @@ def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
     assert at is not None
     sc = problem.scales
     w = beyond_tangent(law, problem.y[problem.skip :] - e * sc.output, problem.rate_hz)
-    v = run(np.hstack([at.A - at.gain @ at.C, at.E]), w / sc.disturbance, np.zeros(at.A.shape[0])) @ at.C.T @ weight.T
+    F, E, size = at.A - at.gain @ at.C, at.E[:, : w.shape[1]], sc.disturbance[: w.shape[1]]  # the others drive noise
+    v = run(np.hstack([F, E]), w / size, np.zeros(len(F))) @ at.C.T @ weight.T
     pulls = products(problem, fit.vector, weight, workspace_near(fit, problem), [(v, (0,))])
     assert pulls is not None
     own, p = range(v.shape[1]), problem.size

@@ -64,6 +64,7 @@ class Workspace:
             same
             and own.extra is new.extra
             and own.lags == new.lags
+            and len(own.model.states) == len(new.model.states)
             and np.array_equal(own.scales.input, new.scales.input)
         )
         if not same or not np.array_equal(own.scales.output, new.scales.output):

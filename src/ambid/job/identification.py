@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from ambid.rotor.estimate import RotorEstimate
     from ambid.validation.causes import Cause
 
-_CAUSES = 3  # by which a model is extended, one after another
+_CAUSES = 6  # by which a model is extended, one after another
 _OF_THE_MODEL = {
     "causes", "residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree",
 }  # fmt: skip
@@ -277,9 +277,9 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
         more = extended(fit, first.operating_point, found, plain, taken, doubtful=doubtful)
         if more is None:
             break
-        fit, taken = more
+        fit, plain, taken = more
         estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
-        estimate = replace(estimate, extended=tuple(dict.fromkeys(told(c) for c in taken)))
+        estimate = replace(estimate, extended=told(fit, taken))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
     worse = after & _OF_THE_MODEL or after - before - {"fixed_agree"} or len(after) >= len(before)
     return first if worse else estimate

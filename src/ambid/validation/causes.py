@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.bearing.uncertainty import farthest
 from ambid.estimation.calibration import explaining, lines_of
+from ambid.estimation.colours import Colour, coloured, colours_of
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import (
@@ -48,18 +48,21 @@ _ALIKE = 0.7  # part of the strongest cause's gain from which another explains t
 _BLIND = 1e-12  # eigenvalue, over the largest, of directions that are not seen
 _SAME = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
 _SMOOTH = 9  # lines that are averaged to see a mode or a band
-_BAND = 10  # lines on either side of a band's middle
+_POLES = 9  # corners of low passes, and widths of resonances, that are tried
+_POWERS = np.geomspace(0.1, 1e6, 12)  # of coloured noise over the white innovations, where it stands highest
 _NARROW = 0.6  # part of the power around a line that its own three frequencies hold
 _LINES, _SKIRT = 6, 4  # lines that are taken together, and how far each reaches
 _CLEAR = 10.0  # power, of noise one, that no other channel of a line may leave less than, nor its own more
 _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
-_SAME_COURSE = ("line", "slow_force", "slow_voltage", "slow_current", "coloured_force", "coloured_voltage")
+_SAME_COURSE = ("line", "slow_force", "slow_voltage", "slow_current")
 """Causes whose signals do not depend on the fit."""
-_IN_TIME = {*_SAME_COURSE, "r_drift"}
+_NOISE = {f"{how}_{where}" for how in ("slow", "coloured") for where in ("force", "voltage", "position", "current")}
+"""Noise that is not white."""
+_IN_TIME = {*_SAME_COURSE, *_NOISE, "r_drift"}
 """Causes that change in time, which no constant of the plant can imitate."""
 _GROWING = {
-    *_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature", "dead_time",
+    *_IN_TIME, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "curvature", "dead_time",
     "friction", "amplifier_lag",
 }  # fmt: skip
 """Causes whose signals are known but for their sizes."""
@@ -87,6 +90,7 @@ class Cause:
     shift: Array  # (n_physical,), SI, what the estimate lacks for leaving it out, as far as it is more than chance
     sizes: Array  # (n_columns,), SI, of all its columns
     columns: tuple[Column, ...] = ()
+    colour: Colour | None = None  # noise that it is
     far: bool = False  # a fixed value that would have to change by more than itself: what is missing lies elsewhere
 
 
@@ -129,25 +133,20 @@ def causes(
     course, rate_hz = look.course, fit.problem.rate_hz
     spectra = _spectra(look.e @ look.weight.T)
     lines = _lines(look)
-    top, chance = _top(spectra, lines) if thorough else (0, 1.0)
-    top_hz = top * rate_hz / course.t.size
+    top_hz = _top(spectra, lines) * rate_hz / course.t.size if thorough else 0.0
     groups = list(groups_of(course, top_hz, thorough=thorough))
-    if chance < _LINE:
-        waves = [w for k in range(max(top - _BAND, 1), top + _BAND + 1) for w in waves_at(k, course.t.size).T[:2]]
-        groups += [(f"coloured_{way}", tuple(((way, w),) for w in waves)) for way in ("force", "voltage")]
     if delay_given:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
     groups += [("line", _waving(lines, course.t.size))] if lines else []
     found = _tested(look, groups)
-    found = [replace(c, size=top_hz) if c.name.startswith("coloured") else c for c in found]
     if lines:
         line = found.pop()
         at, p = lines[0].k * rate_hz / course.t.size, min(line.p, lines[0].p)
         found.append(replace(line, channel=lines[0].channel, size=at, p=p))
     found += _fixed(fit, rig, {name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed)
     if thorough:
-        found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
+        found += _colours(spectra, _ways(look, slice(None)), rate_hz, fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
     return [
         c for c in found if (c.name != "slow_current" or c is found[0]) and not (c.name in _OPPOSING and c.size < 0.0)
@@ -204,31 +203,44 @@ def extended(
     taken: Sequence[Cause],
     *,
     doubtful: bool,
-) -> tuple[Fit, tuple[Cause, ...]] | None:
+) -> tuple[Fit, PredictorProblem, tuple[Cause, ...]] | None:
     """Fit again with the strongest cause of those `found`, and those about as strong or else alone, their sizes
-    estimated beside the parameters.
+    estimated beside the parameters; with noise that is not white where that is the strongest, or a walk goes on.
 
-    `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new
-    ones. None where one of them cannot be taken in, or may stand for a fixed value that is `doubtful`, or the search
-    does not settle. The record is corrected by an error of a sensor; a force or a voltage is known to the
-    predictor. Sizes and parameters are found in turn, and the information of the parameters is what is left beside the
-    sizes.
+    `plain`, `taken`: the problem before any cause but coloured noise, and those that `fit` holds already; they come
+    back with the new ones. None where one of them cannot be taken in, or the search does not settle; where a fixed
+    value is `doubtful`, only what it cannot stand for is. The record is corrected by an error of a sensor; a force or a
+    voltage is known to the predictor. Sizes and parameters are found in turn, and the information of the parameters is
+    what is left beside the sizes.
     """
     sure = [c for c in _sure(found) if c.name not in _KNOWN]
     if not sure or fit.problem.n_used > _LONGEST:
         return None
-    cause = sure[0]
-    strong = [c for c in reversed(sure) if c.gain > _ALIKE * cause.gain]
-    alike = {(c.name, c.channel): c for c in strong if (c.name, c.channel) != (cause.name, cause.channel)}
-    allowed = _IN_TIME if doubtful else _GROWING
-    if any(not c.columns or c.name not in allowed for c in (cause, *alike.values())):
+    strong = [c for c in sure if c.gain > _ALIKE * sure[0].gain]
+    if doubtful:
+        strong = [c for c in strong if c.name in _IN_TIME]
+    if not strong or any(c.name not in _GROWING for c in strong):
         return None
-    n, size = fit.problem.n_physical, fit.problem.magnitude
-    sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
-    if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
-        return None  # what is of higher degree would move them too
-    more = _with_causes(fit, means, plain, taken, (cause, *alike.values()))
-    return _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
+    cause, more = strong[0], None
+    alike = {(c.name, c.channel): c for c in reversed(strong) if c.columns}
+    alike.pop((cause.name, cause.channel), None)
+    if cause.columns:
+        n, size = fit.problem.n_physical, fit.problem.magnitude
+        sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
+        if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
+            return None  # what is of higher degree would move them too
+        more = _with_causes(fit, means, plain, taken, (cause, *alike.values()))
+        more = _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
+    if more is not None:
+        return more[0], plain, more[1]
+    noises = [c.colour for c in found if c.colour and (c in strong or c.name == cause.name)]
+    noises += [c.colour for c in found if c.colour and c.channel == cause.channel and c.colour not in noises]
+    louder = next((better for colour in noises if (better := coloured(fit, [colour])) is not None), None)
+    if louder is None:
+        return None
+    plain = replace(louder.problem, y=plain.y, extra=plain.extra)
+    again = _with_causes(louder, means, plain, taken, ()) if taken else (louder, ())
+    return None if again is None else (again[0], plain, again[1])
 
 
 def _with_causes(
@@ -236,7 +248,7 @@ def _with_causes(
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
     """Fit again with causes beside those `taken`; None where the search does not settle, or a walk goes on."""
     parts = [*taken, *(replace(c, sizes=np.zeros(c.sizes.size)) for c in new)]
-    step = [new[0].sizes if k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
+    step = [new[0].sizes if new and k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
     for _ in range(_TURNS):
         parts = [replace(c, sizes=c.sizes + more) for c, more in zip(parts, step, strict=True)]
         problem = _corrected(plain, [z for c in parts for z in c.columns], np.concatenate([c.sizes for c in parts]))
@@ -274,9 +286,18 @@ def _faster(walk: Cause, course: Course) -> Cause:
     return replace(walk, columns=columns, sizes=np.append(walk.sizes, np.zeros(MANY - walk.sizes.size)))
 
 
-def told(cause: Cause) -> str:
-    """Return a cause and its size, as what a model is extended by."""
-    unit = dict.fromkeys(("line", "coloured_force", "coloured_voltage"), " Hz")
+def told(fit: Fit, taken: Sequence[Cause]) -> tuple[str, ...]:
+    """Return what a fit is extended by: causes `taken`, with their sizes, and coloured noise."""
+    noise = [
+        f"slow_{c.source}" if c.damping is None else f"coloured_{c.source} ({c.frequency_hz:.3g} Hz)"
+        for c in colours_of(fit.problem)
+    ]
+    return tuple(dict.fromkeys([*map(_told, taken), *noise]))
+
+
+def _told(cause: Cause) -> str:
+    """Return a cause and its size."""
+    unit = {"line": " Hz"}
     unit |= dict.fromkeys(("sensor_lag", "eddy_pole", "current_sensor_pole"), " s")
     unit |= {"r_drift": " ohm", "dead_time": " V", "friction": " N"}
     return f"{cause.name} ({cause.size:.3g}{unit[cause.name]})" if cause.name in unit else cause.name
@@ -306,7 +327,7 @@ def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Arra
 
 def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> Course:
     problem = fit.problem
-    x, v, i = (states * problem.scales.state).T
+    x, v, i = (states * problem.scales.state[:3]).T
     theta, delay = problem.parameters(fit.vector), problem.delay_samples(fit.vector)
     whole = int(np.floor(delay))
     first = problem.skip + at.start - whole - 2
@@ -487,18 +508,14 @@ def _lines(look: _Look) -> list[_Line]:
     return lines
 
 
-def _top(spectra: Complex, lines: Sequence[_Line]) -> tuple[int, float]:
-    """Return where the innovations stand highest over some lines that are none of `lines`, in periods, and the
-    probability of that by chance: a Hann window leaves two of three lines independent.
-    """
-    power, n_y = np.sum(np.abs(spectra) ** 2, axis=1), spectra.shape[1]
-    median = float(np.median(power))
+def _top(spectra: Complex, lines: Sequence[_Line]) -> int:
+    """Return where the innovations stand highest over some lines that are none of `lines`, in periods."""
+    power = np.sum(np.abs(spectra) ** 2, axis=1)
     for at in (round(line.k) - 2 for line in lines):
-        power[max(at - _SKIRT, 0) : at + _SKIRT + 1] = median
+        power[max(at - _SKIRT, 0) : at + _SKIRT + 1] = float(np.median(power))
     smooth = np.convolve(power, np.ones(_SMOOTH) / _SMOOTH, mode="same")
     smooth[: 2 * _SMOOTH] = 0.0
-    j, free = int(np.argmax(smooth)), round(4 * _SMOOTH * n_y / 3)
-    return j + 2, power.size * chi_squared_tail(free, free * float(smooth[j]) / max(_mean(median, n_y), 1e-300) / n_y)
+    return int(np.argmax(smooth)) + 2
 
 
 def _mean(median: float, n_y: int) -> float:
@@ -506,25 +523,49 @@ def _mean(median: float, n_y: int) -> float:
     return median / (1.678 if n_y == 2 else np.log(2.0))
 
 
-def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) -> Iterator[Cause]:
-    """Yield a disturbing force or voltage that is not white: its power by octaves against that of white innovations."""
-    edges = np.unique(np.geomspace(1, max(spectra.shape[0] // 5, 2), 14).astype(int))
-    for name in ("force", "voltage"):
-        way = ways[name]
-        power = np.abs(np.sum(way.conj() * spectra, axis=1)) ** 2 / np.maximum(np.sum(np.abs(way) ** 2, axis=1), 1e-300)
-        sums = [(b - a, float(power[a:b].mean())) for a, b in pairwise(edges.tolist()) if b - a >= 4]
-        if len(sums) < 2 or max(m for _, m in sums[:2]) < 0.5 * max(m for _, m in sums):  # not slow
-            continue
-        gain = sum(2.0 * n * (mean - 1.0 - np.log(mean)) for n, mean in sums if mean > 1.0) / 1.5  # of a Hann window
-        yield Cause(
-            name=f"slow_{name}", channel=name, gain=float(gain), p=chi_squared_tail(max(len(sums), 1), float(gain)),
-            size=0.0, shift=np.zeros(n_physical), sizes=np.zeros(len(sums)),
-        )  # fmt: skip
+def _colours(spectra: Complex, ways: Mapping[str, Complex], rate_hz: float, n_physical: int) -> Iterator[Cause]:
+    """Yield for each disturbance and sensor the low pass and the resonance that explain most of the innovations'
+    spectra: noise of power s φ, that shows by a, has log-likelihood Σ P s φ a/(1 + s φ a) - log(1 + s φ a) beside the
+    white one's, with P the power along its way (Whittle 1953).
+    """
+    n = spectra.shape[0]
+    f = np.arange(2, n + 2) * rate_hz / (2 * (n + 2))
+    for source in ("force", "voltage", "position", "current"):
+        way = ways[source]
+        a = np.maximum(np.sum(np.abs(way) ** 2, axis=1), 1e-300)
+        P = np.abs(np.sum(way.conj() * spectra, axis=1)) ** 2 / a
+        slow = [(c, None, 1.0 / (1.0 + (f / c) ** 2)) for c in np.geomspace(f[1], f[-1], _POLES)]
+        fast = [(at, z, 1.0 / (1.0 + ((f / at - at / f) / (2.0 * z)) ** 2)) for at, z in _peaks(P, f)]
+        for name, shapes in (("slow", slow), ("coloured", fast)):
+            gains = [(_explained(P, a * shape / np.max(a * shape)), at, z) for at, z, shape in shapes]
+            gain, at, damping = max(gains, key=lambda g: g[0])
+            colour = Colour(source=source, omega=2.0 * np.pi * at, damping=damping)
+            yield Cause(
+                name=f"{name}_{source}", channel=source, gain=gain, p=min(1.0, n * chi_squared_tail(3, gain)),
+                size=at, shift=np.zeros(n_physical), sizes=np.zeros(1 + colour.order), colour=colour,
+            )  # fmt: skip
+
+
+def _peaks(P: Array, f: Array) -> Iterator[tuple[float, float]]:
+    """Yield where powers stand highest over bands of several widths, and the damping of a resonance as wide."""
+    sums, lines = np.cumsum(np.append(0.0, P)), f.size
+    for width in np.unique(np.geomspace(3, max(lines // 5, 4), _POLES).astype(int)).tolist():
+        mean = (sums[width:] - sums[:-width]) / width
+        j = int(np.argmax(mean[width:])) + width if mean.size > width else 0
+        middle = float(f[j + width // 2])
+        yield middle, max(float(f[width - 1] - f[0]), float(f[1] - f[0])) / (2.0 * middle)
+
+
+def _explained(P: Array, shape: Array) -> float:
+    """Return the fall of the criterion by noise of a shape beside the white innovations, at its likeliest power."""
+    more = _POWERS[:, None] * shape
+    return float(np.max(np.sum(P * more / (1.0 + more) - np.log1p(more), axis=1))) * 2.0 / 1.5  # of a Hann window
 
 
 _SAME_AS = {
     "sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",), "coloured_force": ("line",),
-    "coloured_voltage": ("line",), "amplifier_lag": ("limiter", "current_sensor_pole"),
+    "coloured_voltage": ("line",), "coloured_position": ("line",), "coloured_current": ("line",),
+    "amplifier_lag": ("limiter", "current_sensor_pole"),
     "cross_talk": ("sensor_lag", "current_lag"),
 }  # fmt: skip
 """What the first order of a score does not distinguish."""
@@ -544,6 +585,11 @@ _TEXT = {
     "coloured_force": "a force around {size:.4g} Hz changes in amplitude and phase: unbalance of changing speed, flow "
     "or motion of the base. Remove its source, or excite beside it",
     "coloured_voltage": "the voltage around {size:.4g} Hz changes in amplitude and phase. Check the amplifier's supply",
+    "coloured_position": "the position's sensor has noise around {size:.4g} Hz that changes in amplitude and phase: "
+    "light, or an aliased tone. Filter before sampling",
+    "coloured_current": "the current's sensor has noise around {size:.4g} Hz that changes in amplitude and phase: an "
+    "aliased tone of the amplifier. Filter before sampling, or lock the sampling to it",
+    "slow_position": "the position's sensor drifts. Measure its zero before and after, or record shorter",
     "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
     "longer, or excite above it",
     "slow_current": "the current's sensor drifts. Measure its zero before and after, or record shorter",

@@ -1,0 +1,240 @@
+"""Coloured noise beside the white parts of a linear model: low passes and resonances that white noise drives, each one
+more source of a disturbance or of a sensor's error (Ljung 1999, sec. 4.2; Anderson and Moore 1979, sec. 11.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.likelihood import Fit, Workspace, evaluate, search
+from ambid.estimation.predictor import PredictorProblem
+from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
+
+_LEVEL = -2.0  # centre of the weak prior on the log level
+_OVER = (-4.0, -2.0, 0.0, 2.0, 4.0)  # logarithm of its level over that of the white part, at the start
+_FACTORS = (0.7, 0.85, 0.97, 1.0, 1.03, 1.15, 1.4)  # of a frequency, to find a likelier one
+_WIDTHS = (0.5, 0.8, 1.0, 1.25, 2.0)  # and of a damping
+_MOVES = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Colour:
+    """A low pass, or a resonance of a damping, of one source: a disturbance, or the sensor of an output."""
+
+    source: str
+    omega: float  # rad/s
+    damping: float | None = None
+
+    @property
+    def order(self) -> int:
+        """Number of its states."""
+        return 1 if self.damping is None else 2
+
+    @property
+    def frequency_hz(self) -> float:
+        """Its corner, or its middle."""
+        return self.omega / (2.0 * np.pi)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Coloured:
+    """A linear model whose noise has coloured parts; their states and what drives them come last."""
+
+    plain: LinearModel
+    colours: tuple[Colour, ...]
+
+    @property
+    def name(self) -> str:
+        """Of the model."""
+        return self.plain.name
+
+    @property
+    def summary(self) -> str:
+        """Of the model."""
+        return self.plain.summary
+
+    @property
+    def parameters(self) -> tuple[ParameterSpec, ...]:
+        """Of the model."""
+        return self.plain.parameters
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Of the model."""
+        return self.plain.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Of the model."""
+        return self.plain.outputs
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Of the model."""
+        return self.plain.units
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Of the model, and of the colours."""
+        return (*self.plain.states, *(f"{c.source}.{k}" for c in self.colours for k in range(c.order)))
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Of the model, and what drives the colours."""
+        return (*self.plain.disturbances, *(f"{c.source}.{k}" for k, c in enumerate(self.colours)))
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return the matrices with c' = w (d - c) for a low pass, c' = -2 z w c - w s + 2 z w d, s' = w c for a
+        resonance, which passes its middle unchanged.
+        """
+        space, n = self._beside(self.plain.matrices(theta)), len(self.plain.states)
+        for j, colour in enumerate(self.colours, len(self.plain.disturbances)):
+            w, z = colour.omega, colour.damping
+            space.A[n, n], space.E[n, j] = (-w, w) if z is None else (-2.0 * z * w, 2.0 * z * w)
+            if z is not None:
+                space.A[n, n + 1], space.A[n + 1, n] = -w, w
+            if colour.source in self.plain.outputs:
+                space.C[self.plain.outputs.index(colour.source), n] = 1.0
+            n += colour.order
+        return space
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return the model's derivative: no parameter moves a colour but by the way of its disturbance."""
+        return self._beside(self.plain.derivative(theta, parameter))
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Of the model."""
+        return self.plain.references(theta)
+
+    def _beside(self, space: StateSpace) -> StateSpace:
+        """Return matrices, or slopes of them, with room for colours and the way of those that disturb."""
+        (n, _), more = space.E.shape, sum(c.order for c in self.colours)
+        wide = StateSpace(
+            A=np.pad(space.A, (0, more)), B=np.pad(space.B, ((0, more), (0, 0))),
+            E=np.pad(space.E, ((0, more), (0, len(self.colours)))), C=np.pad(space.C, ((0, 0), (0, more))),
+        )  # fmt: skip
+        for colour in self.colours:
+            if colour.source in self.plain.disturbances:
+                wide.A[: len(self.plain.states), n] = space.E[:, self.plain.disturbances.index(colour.source)]
+            n += colour.order
+        return wide
+
+
+def colours_of(problem: PredictorProblem) -> tuple[Colour, ...]:
+    """Return the coloured parts of a problem's noise."""
+    return problem.model.colours if isinstance(problem.model, Coloured) else ()
+
+
+def with_colours(
+    problem: PredictorProblem, vector: Array, colours: Sequence[Colour], over: float = 0.0
+) -> tuple[PredictorProblem, Array]:
+    """Return a problem with further coloured parts, and its vector with their log levels `over` those of the white
+    parts of their sources.
+    """
+    plain = problem.model.plain if isinstance(problem.model, Coloured) else problem.model
+    scales, end, white = problem.scales, len(problem.model.disturbances), len(plain.disturbances)
+    at = [(*plain.disturbances, *plain.outputs).index(c.source) for c in colours]
+    size = np.concatenate([scales.disturbance[:white], scales.output])[at]
+    noise = vector[problem.slices["noise"]]
+    levels = np.concatenate([noise[:white], [0.0], noise[end:]])[at] + over
+    orders = [c.order for c in colours]
+    more = replace(
+        problem, model=Coloured(plain=plain, colours=(*colours_of(problem), *colours)),
+        unsteady=problem.unsteady + len(at),
+        scales=replace(
+            scales, state=np.append(scales.state, np.repeat(size, orders)),
+            disturbance=np.append(scales.disturbance, size),
+        ),
+        noise_center=np.insert(problem.noise_center, end, np.full(len(at), _LEVEL)),
+        extra=None if problem.extra is None else np.pad(problem.extra, ((0, 0), (0, len(at)))),
+    )  # fmt: skip
+    place = problem.slices["noise"].start + end
+    return more, np.append(np.insert(vector, place, levels), np.zeros(sum(orders)))
+
+
+def coloured(fit: Fit, colours: Sequence[Colour], tick: Callable[[], None] | None = None) -> Fit | None:
+    """Fit again with coloured parts of one frequency and damping, at the likeliest; None where that does not settle, or
+    gains less than its numbers cost (BIC).
+    """
+    before = fit if fit.problem.noise == "levels" else _with_levels(fit, tick)
+    best = _likeliest((with_colours(before.problem, before.vector, colours, over) for over in _OVER), np.inf, tick)
+    for _ in range(_MOVES):
+        if best is None:
+            return None
+        more = _likeliest(_moved(best, len(colours)), best.criterion - 1.0, tick)
+        if more is None or not more.criterion < best.criterion:
+            break
+        best = more
+    if best is None or best.status != "converged":
+        return None
+    numbers = best.problem.slices["offset"].start - fit.problem.slices["offset"].start + colours[0].order
+    return best if fit.criterion - best.criterion > numbers * np.log(fit.problem.y.size) else None
+
+
+def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
+    """Fit again with the noise as levels, instead of a gain that holds colours of its own."""
+    problem = replace(fit.problem, noise="levels")
+    own, vector = fit.problem.slices, np.empty(problem.size)
+    for group, there in problem.slices.items():
+        vector[there] = problem.noise_center if group == "noise" else fit.vector[own[group]]
+    return search(problem, vector, tick=tick)
+
+
+def _moved(fit: Fit, count: int) -> Iterator[tuple[PredictorProblem, Array]]:
+    """Yield problems with the last colours elsewhere, and vectors for them: of the same power, or the same level."""
+    problem = fit.problem
+    assert isinstance(problem.model, Coloured)
+    rest, last = problem.model.colours[:-count], problem.model.colours[-count:]
+    end = problem.slices["noise"].start + len(problem.model.disturbances)
+    for by, wider in product(_FACTORS, _WIDTHS if last[0].damping else (1.0,)):
+        if (by, wider) == (1.0, 1.0) or last[0].omega * by > np.pi * problem.rate_hz:
+            continue
+        moved = (replace(c, omega=c.omega * by, damping=c.damping and c.damping * wider) for c in last)
+        elsewhere = replace(problem, model=replace(problem.model, colours=(*rest, *moved)))
+        for power in (0.0, 1.0):
+            vector = fit.vector.copy()
+            vector[end - count : end] -= power * np.log(by * wider)
+            yield elsewhere, vector
+
+
+def without_colours(fit: Fit) -> Fit:
+    """Return a fit of white noise alone, at the numbers of a fit with coloured parts: what a reader of the plant's own
+    order can use.
+    """
+    problem, n_c = fit.problem, len(colours_of(fit.problem))
+    if not isinstance(problem.model, Coloured):
+        return fit
+    plain, n = problem.model.plain, problem.n_physical
+    states, white = len(plain.states), len(plain.disturbances)
+    scales = replace(
+        problem.scales, state=problem.scales.state[:states], disturbance=problem.scales.disturbance[:white]
+    )
+    alone = replace(
+        problem, model=plain, estimated=(), known=problem.parameters(fit.vector), magnitude=np.zeros(0),
+        prior_mean=np.zeros(0), prior_sd=np.zeros(0), joint_priors=None, scales=scales,
+        unsteady=problem.unsteady - n_c, noise_center=np.delete(problem.noise_center, slice(white, white + n_c)),
+        extra=None if problem.extra is None else problem.extra[:, :white],
+    )  # fmt: skip
+    level = problem.slices["noise"].start + white
+    vector = np.delete(fit.vector, slice(level, level + n_c))[n : n + alone.size]
+    return search(alone, vector)
+
+
+def _likeliest(
+    trials: Iterable[tuple[PredictorProblem, Array]], above: float, tick: Callable[[], None] | None
+) -> Fit | None:
+    """Search from the likeliest of several problems; None where none is below a criterion."""
+    least, at, work = np.inf, None, None
+    for problem, vector in trials:
+        work = Workspace(problem) if work is None else work.of(problem)
+        value = evaluate(problem, vector, work)[0]
+        least, at = (value, (problem, vector)) if value < least else (least, at)
+    if at is None or not least < above:
+        return None
+    fit = search(*at, tick=tick, work=work)
+    return None if fit.status == "failed" else fit
