@@ -6,16 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import ambid
 from ambid.bearing.linear import greybox
 from ambid.estimation.estimate import Check
 from ambid.job.data import load_bench, signals_of
+from ambid.physics.linear_model import model
+from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig, rig_of_preset
+from ambid.signals import multisine
+from ambid.simulation import LinearPlant, simulate
+from ambid.simulation.variation import Schedule, Variation
 from ambid.validation.causes import Cause, causes, causes_check, named_bias
 from ambid.validation.physical import by_bands
+from tests.bearing.benches import SETTINGS
 from tests.tiers import runs
 
 
@@ -288,6 +295,53 @@ def test_a_force_whose_frequency_changes_is_named_by_its_band_and_taken_in():
     sure = strongest(columns, clean.rate_hz)
     assert sure[0].name in ("coloured_force", "coloured_voltage", "line")
     assert sure[0].size == pytest.approx(61.5, abs=4.0)
+
+
+def walked(seed, tau_s, newton):
+    """A record under a force that is forgotten in `tau_s`, of an rms in N, and its truth."""
+    s, rng = SETTINGS["bearing"], np.random.default_rng(seed)
+    u = multisine(8192, s.rate_hz, amplitude=s.rms, band=s.band, seed=seed, amplitude_is="rms")
+    keep = np.exp(-1.0 / (tau_s * s.rate_hz))
+    force = lfilter([newton * np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(u.size))
+    done = simulate(
+        LinearPlant(model=model(s.model), parameters=s.truth), u, rate_hz=s.rate_hz, seed=seed, loop=s.loop,
+        noise=Noise.held(rate_hz=s.rate_hz, **s.noise),
+        variation=Variation(force=Schedule(times_s=tuple(np.arange(u.size) / s.rate_hz), values=tuple(force))),
+    )  # fmt: skip
+    return {c.name: c.values for c in done.record.channels}, s.rate_hz, s.truth
+
+
+def test_a_force_that_walks_is_taken_in_as_noise():
+    """It goes on beyond any waves: a low pass of the force holds it, and intervals are right."""
+    usable, beyond = 0, 0
+    for seed in range(1, 1 + runs(12, short=3)):
+        columns, rate_hz, truth = walked(seed, 0.02, 30 * SETTINGS["bearing"].noise["force"])
+        estimate = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+        assert "slow_force" in estimate.extended
+        usable += estimate.verdict.word == "usable"
+        beyond += sum(abs(estimate[k].value - truth[k]) > 1.96 * estimate[k].sd for k in ("m", "k_x", "k_i", "R", "L"))
+        assert estimate.noise.gain.shape == (3, 2)  # of the plant's own order, for those who read it
+    n = runs(12, short=3)
+    assert usable >= 0.8 * n
+    assert beyond <= 5 * n * 0.05 + 3.0 * np.sqrt(5 * n * 0.05)
+
+
+def test_noise_of_a_band_in_the_current_is_named_with_its_middle_and_taken_in():
+    """An aliased tone of an amplifier that changes in amplitude and phase."""
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    clean = ambid.identify(columns, rate_hz=rate_hz, units=UNITS)
+    rng, n = np.random.default_rng(1), columns["current"].size
+    turn, keep = 2 * np.pi * 300.0 / rate_hz, np.exp(-2 * np.pi * 10.0 / rate_hz)
+    tone = lfilter([1.0], [1.0, -2 * keep * np.cos(turn), keep**2], rng.standard_normal(n))
+    noisy = {**columns, "current": columns["current"] + 5e-3 * tone / tone.std()}
+    first = strongest(noisy, rate_hz)[0]
+    assert first.name in ("coloured_current", "coloured_voltage")
+    assert first.size == pytest.approx(300.0, abs=20.0)
+    estimate = ambid.identify(noisy, rate_hz=rate_hz, units=UNITS)
+    assert estimate.extended[0].startswith("coloured_")
+    assert estimate.verdict.word == "usable"
+    for name in ("m", "k_x", "k_i", "R", "L"):
+        assert estimate[name].value == pytest.approx(clean[name].value, abs=3.0 * estimate[name].sd)
 
 
 def test_a_line_whose_channel_is_not_clear_is_held_by_force_and_voltage():

@@ -12,6 +12,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.likelihood import Fit, Workspace, evaluate, search
+from ambid.estimation.linear import directions
 from ambid.estimation.predictor import PredictorProblem
 from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 
@@ -20,6 +21,11 @@ _OVER = (-4.0, -2.0, 0.0, 2.0, 4.0)  # logarithm of its level over that of the w
 _FACTORS = (0.7, 0.85, 0.97, 1.0, 1.03, 1.15, 1.4)  # of a frequency, to find a likelier one
 _WIDTHS = (0.5, 0.8, 1.0, 1.25, 2.0)  # and of a damping
 _MOVES = 6
+_RISE = 4.0  # of the criterion, to the end of what a record allows
+_STEP, _FARTHEST = 0.25, 5.0  # logarithms of the first move of a place, and of the last
+_SOON = 15  # steps of a search beside
+_PLACES = 9  # corners of low passes, and widths of resonances, that are looked at
+_POWERS = np.geomspace(0.1, 1e6, 12)  # of coloured noise over white, where it stands highest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,6 +208,52 @@ def _moved(fit: Fit, count: int) -> Iterator[tuple[PredictorProblem, Array]]:
             yield elsewhere, vector
 
 
+def left_open(fit: Fit) -> Array:
+    """Return what the places of coloured parts, known no better than the record shows them, add to the covariance of
+    the physical parameters, (n_physical, n_physical), over their magnitudes: a force that walks and a stiffness take
+    each other's place, along curves that a local covariance does not see. Each place is moved until the criterion,
+    all else fitted again, has risen by `_RISE`; a step over the root of its rise is one standard deviation.
+    """
+    problem, n = fit.problem, fit.problem.n_physical
+    total = np.zeros((n, n))
+    for j, colour in enumerate(colours_of(problem)):
+        for what in ("omega", "damping")[: colour.order]:
+            steps, work = [np.zeros(n)], fit.work
+            for way in (-1.0, 1.0):
+                near, by = fit.vector, _STEP
+                while by < _FARTHEST:
+                    moved = replace(colour, **{what: getattr(colour, what) * np.exp(way * by)})
+                    there = _at(problem, j, moved)
+                    if moved.omega > np.pi * problem.rate_hz:
+                        break
+                    again = search(there, near, steps=_SOON, work=None if work is None else work.of(there))
+                    rise = again.criterion - fit.criterion
+                    if not rise < np.inf:
+                        break
+                    near = again.vector
+                    steps.append((near[:n] - fit.vector[:n]) / np.sqrt(max(rise, 1.0)))
+                    if rise > _RISE:
+                        break
+                    by *= 2.0
+            far = np.array(steps)[np.argmax(np.sum((np.array(steps) @ _whitener(fit)) ** 2, axis=1))]
+            total += np.outer(far, far)
+    return total
+
+
+def _whitener(fit: Fit) -> Array:
+    """Return what physical steps are multiplied by to be in their standard deviations."""
+    n = fit.problem.n_physical
+    inverse = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(inverse)).T)
+
+
+def _at(problem: PredictorProblem, j: int, colour: Colour) -> PredictorProblem:
+    """Return a problem with its j-th colour elsewhere."""
+    assert isinstance(problem.model, Coloured)
+    colours = problem.model.colours
+    return replace(problem, model=replace(problem.model, colours=(*colours[:j], colour, *colours[j + 1 :])))
+
+
 def without_colours(fit: Fit) -> Fit:
     """Return a fit of white noise alone, at the numbers of a fit with coloured parts: what a reader of the plant's own
     order can use.
@@ -238,3 +290,36 @@ def _likeliest(
         return None
     fit = search(*at, tick=tick, work=work)
     return None if fit.status == "failed" else fit
+
+
+def likely_colours(source: str, power: Array, way: Array, frequency_hz: Array) -> list[tuple[float, Colour]]:
+    """Return the low pass and the resonance of a source that explain most of innovations, with the criterion's fall.
+
+    `power` (n_lines,): of white innovations' spectra along the way by which the source shows, whose own power is `way`.
+    Noise s φ beside them lowers the criterion by 2 Σ P s φ a/(1 + s φ a) - log(1 + s φ a) (Whittle 1953).
+    """
+    f = frequency_hz
+    low = [(c, None, 1.0 / (1.0 + (f / c) ** 2)) for c in np.geomspace(f[1], f[-1], _PLACES).tolist()]
+    high = [(at, z, 1.0 / (1.0 + ((f / at - at / f) / (2.0 * z)) ** 2)) for at, z in _peaks(power, f)]
+    found = list[tuple[float, Colour]]()
+    for shapes in (low, high):
+        gains = [(_explained(power, way * shape / np.max(way * shape)), at, z) for at, z, shape in shapes]
+        gain, at, damping = max(gains, key=lambda g: g[0])
+        found.append((gain, Colour(source=source, omega=2.0 * np.pi * at, damping=damping)))
+    return found
+
+
+def _peaks(power: Array, f: Array) -> Iterator[tuple[float, float]]:
+    """Yield where powers stand highest over bands of several widths, and the damping of a resonance as wide."""
+    sums, lines = np.cumsum(np.append(0.0, power)), f.size
+    for width in np.unique(np.geomspace(3, max(lines // 5, 4), _PLACES).astype(int)).tolist():
+        mean = (sums[width:] - sums[:-width]) / width
+        j = int(np.argmax(mean[width:])) + width if mean.size > width else 0
+        middle = float(f[j + width // 2])
+        yield middle, float(f[width - 1] - f[0]) / (2.0 * middle)
+
+
+def _explained(power: Array, shape: Array) -> float:
+    """Return the fall of the criterion by noise of a shape beside white noise, at its likeliest level."""
+    more = _POWERS[:, None] * shape
+    return 2.0 * float(np.max(np.sum(power * more / (1.0 + more) - np.log1p(more), axis=1)))

@@ -11,7 +11,6 @@ from ambid.arrays import Array
 from ambid.estimation.likelihood import run
 
 WAVES = 8  # half waves over the record of a force or voltage that walks
-MANY = 40  # and of one that was looked for because a check failed
 _DAMPING = (0.005, 0.03)  # with which it is looked for
 _REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
 _PLAY = 0.1  # of the current's range: width of a hysteresis
@@ -61,7 +60,6 @@ def groups_of(s: Course, mode: float, *, thorough: bool) -> Iterator[tuple[str, 
     slack = _play(s.i, _PLAY * float(np.ptp(s.i))) - s.i
     flux = -s.theta["L"] * _rate(slack, s.rate_hz)
     yield "hysteresis", ((("force", s.theta["k_i"] * _between(slack)),), (("voltage", flux),))
-    yield "slow_force", tuple((("force", wave),) for wave in half_waves(s.t, MANY))
     for damping in _DAMPING:
         yield "flexible_mode", tuple((("position", q),) for q in _oscillation(s, mode, damping))
 

@@ -21,7 +21,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.bearing.uncertainty import farthest
 from ambid.estimation.calibration import explaining, lines_of
-from ambid.estimation.colours import Colour, coloured, colours_of
+from ambid.estimation.colours import Colour, coloured, colours_of, left_open, likely_colours
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import (
@@ -39,7 +39,7 @@ from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, bu
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
 from ambid.rig import Rig
-from ambid.validation.cause_signals import MANY, WAVES, Column, Course, groups_of, half_waves
+from ambid.validation.cause_signals import WAVES, Column, Course, groups_of
 from ambid.validation.facts import between_samples
 
 _LONGEST = 100_000  # samples that are looked at, the busiest
@@ -48,18 +48,14 @@ _ALIKE = 0.7  # part of the strongest cause's gain from which another explains t
 _BLIND = 1e-12  # eigenvalue, over the largest, of directions that are not seen
 _SAME = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
 _SMOOTH = 9  # lines that are averaged to see a mode or a band
-_POLES = 9  # corners of low passes, and widths of resonances, that are tried
-_POWERS = np.geomspace(0.1, 1e6, 12)  # of coloured noise over the white innovations, where it stands highest
 _NARROW = 0.6  # part of the power around a line that its own three frequencies hold
 _LINES, _SKIRT = 6, 4  # lines that are taken together, and how far each reaches
 _CLEAR = 10.0  # power, of noise one, that no other channel of a line may leave less than, nor its own more
 _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
-_SAME_COURSE = ("line", "slow_force", "slow_voltage", "slow_current")
-"""Causes whose signals do not depend on the fit."""
 _NOISE = {f"{how}_{where}" for how in ("slow", "coloured") for where in ("force", "voltage", "position", "current")}
 """Noise that is not white."""
-_IN_TIME = {*_SAME_COURSE, *_NOISE, "r_drift"}
+_IN_TIME = {*_NOISE, "line", "r_drift"}
 """Causes that change in time, which no constant of the plant can imitate."""
 _GROWING = {
     *_IN_TIME, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "curvature", "dead_time",
@@ -70,7 +66,6 @@ _KNOWN = {"fixed_value", "sensor_gain", "rate"}
 """Causes in what the rig says."""
 _OPPOSING = {"dead_time", "friction"}
 """Causes that physics gives a sign."""
-_GOES_ON = 0.01  # probability by chance, of faster waves, below which a walk goes on beyond those that were taken
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
@@ -205,7 +200,7 @@ def extended(
     doubtful: bool,
 ) -> tuple[Fit, PredictorProblem, tuple[Cause, ...]] | None:
     """Fit again with the strongest cause of those `found`, and those about as strong or else alone, their sizes
-    estimated beside the parameters; with noise that is not white where that is the strongest, or a walk goes on.
+    estimated beside the parameters; with noise that is not white where that is the strongest.
 
     `plain`, `taken`: the problem before any cause but coloured noise, and those that `fit` holds already; they come
     back with the new ones. None where one of them cannot be taken in, or the search does not settle; where a fixed
@@ -222,9 +217,9 @@ def extended(
     if not strong or any(c.name not in _GROWING for c in strong):
         return None
     cause, more = strong[0], None
-    alike = {(c.name, c.channel): c for c in reversed(strong) if c.columns}
+    alike = {(c.name, c.channel): c for c in reversed(strong) if c.name not in _NOISE}
     alike.pop((cause.name, cause.channel), None)
-    if cause.columns:
+    if cause.name not in _NOISE:
         n, size = fit.problem.n_physical, fit.problem.magnitude
         sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
         if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
@@ -239,14 +234,14 @@ def extended(
     if louder is None:
         return None
     plain = replace(louder.problem, y=plain.y, extra=plain.extra)
-    again = _with_causes(louder, means, plain, taken, ()) if taken else (louder, ())
+    again = _with_causes(louder, means, plain, taken, ()) if taken else (replace(louder, beside=left_open(louder)), ())
     return None if again is None else (again[0], plain, again[1])
 
 
 def _with_causes(
     fit: Fit, means: Mapping[str, float], plain: PredictorProblem, taken: Sequence[Cause], new: Sequence[Cause]
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
-    """Fit again with causes beside those `taken`; None where the search does not settle, or a walk goes on."""
+    """Fit again with causes beside those `taken`; None where the search does not settle."""
     parts = [*taken, *(replace(c, sizes=np.zeros(c.sizes.size)) for c in new)]
     step = [new[0].sizes if new and k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
     for _ in range(_TURNS):
@@ -261,29 +256,8 @@ def _with_causes(
         left = _tested(look, [("", tuple(columns))])[0]
         step = np.split(left.sizes, np.cumsum([c.sizes.size for c in parts])[:-1])
         if left.gain < _SETTLED and fit.status == "converged":
-            on = [_goes_on(look, c) for c in parts]
-            if not any(on):
-                return replace(fit, beside=_beside(look, columns)), tuple(parts)
-            if any(goes and len(c.columns) >= MANY for goes, c in zip(on, parts, strict=True)):
-                return None
-            parts = [_faster(c, look.course) if goes else c for goes, c in zip(on, parts, strict=True)]
-            step = [np.zeros(c.sizes.size) for c in parts]
+            return replace(fit, beside=_beside(look, columns) + left_open(fit)), tuple(parts)
     return None
-
-
-def _goes_on(look: _Look, walk: Cause) -> bool:
-    """Return whether a walk that a fit holds goes on beyond its waves, where it would pass for motion of the rotor."""
-    if not walk.name.startswith("slow"):
-        return False
-    count = len(walk.columns)
-    beyond = half_waves(look.course.t, max(2 * count, MANY))[count:]
-    return _tested(look, [(walk.name, tuple(((walk.channel, wave),) for wave in beyond))])[0].p < _GOES_ON
-
-
-def _faster(walk: Cause, course: Course) -> Cause:
-    """Return a walk with faster waves beside its own."""
-    columns = tuple(((walk.channel, wave),) for wave in half_waves(course.t, MANY))
-    return replace(walk, columns=columns, sizes=np.append(walk.sizes, np.zeros(MANY - walk.sizes.size)))
 
 
 def told(fit: Fit, taken: Sequence[Cause]) -> tuple[str, ...]:
@@ -304,8 +278,8 @@ def _told(cause: Cause) -> str:
 
 
 def _again(cause: Cause, course: Course) -> tuple[Column, ...]:
-    """Return a cause's signals at another fit: those of lines and walks are the same."""
-    if cause.name in _SAME_COURSE:
+    """Return a cause's signals at another fit: those of lines are the same."""
+    if cause.name == "line":
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
     groups = groups_of(course, 0.0, thorough=False)
@@ -524,42 +498,19 @@ def _mean(median: float, n_y: int) -> float:
 
 
 def _colours(spectra: Complex, ways: Mapping[str, Complex], rate_hz: float, n_physical: int) -> Iterator[Cause]:
-    """Yield for each disturbance and sensor the low pass and the resonance that explain most of the innovations'
-    spectra: noise of power s φ, that shows by a, has log-likelihood Σ P s φ a/(1 + s φ a) - log(1 + s φ a) beside the
-    white one's, with P the power along its way (Whittle 1953).
-    """
+    """Yield for each disturbance and sensor the low pass and the resonance that explain most of the innovations."""
     n = spectra.shape[0]
     f = np.arange(2, n + 2) * rate_hz / (2 * (n + 2))
     for source in ("force", "voltage", "position", "current"):
         way = ways[source]
         a = np.maximum(np.sum(np.abs(way) ** 2, axis=1), 1e-300)
-        P = np.abs(np.sum(way.conj() * spectra, axis=1)) ** 2 / a
-        slow = [(c, None, 1.0 / (1.0 + (f / c) ** 2)) for c in np.geomspace(f[1], f[-1], _POLES)]
-        fast = [(at, z, 1.0 / (1.0 + ((f / at - at / f) / (2.0 * z)) ** 2)) for at, z in _peaks(P, f)]
-        for name, shapes in (("slow", slow), ("coloured", fast)):
-            gains = [(_explained(P, a * shape / np.max(a * shape)), at, z) for at, z, shape in shapes]
-            gain, at, damping = max(gains, key=lambda g: g[0])
-            colour = Colour(source=source, omega=2.0 * np.pi * at, damping=damping)
+        along = np.abs(np.sum(way.conj() * spectra, axis=1)) ** 2 / a
+        for name, (gain, colour) in zip(("slow", "coloured"), likely_colours(source, along, a, f), strict=True):
+            gain /= 1.5  # of a Hann window
             yield Cause(
                 name=f"{name}_{source}", channel=source, gain=gain, p=min(1.0, n * chi_squared_tail(3, gain)),
-                size=at, shift=np.zeros(n_physical), sizes=np.zeros(1 + colour.order), colour=colour,
+                size=colour.frequency_hz, shift=np.zeros(n_physical), sizes=np.zeros(1 + colour.order), colour=colour,
             )  # fmt: skip
-
-
-def _peaks(P: Array, f: Array) -> Iterator[tuple[float, float]]:
-    """Yield where powers stand highest over bands of several widths, and the damping of a resonance as wide."""
-    sums, lines = np.cumsum(np.append(0.0, P)), f.size
-    for width in np.unique(np.geomspace(3, max(lines // 5, 4), _POLES).astype(int)).tolist():
-        mean = (sums[width:] - sums[:-width]) / width
-        j = int(np.argmax(mean[width:])) + width if mean.size > width else 0
-        middle = float(f[j + width // 2])
-        yield middle, max(float(f[width - 1] - f[0]), float(f[1] - f[0])) / (2.0 * middle)
-
-
-def _explained(P: Array, shape: Array) -> float:
-    """Return the fall of the criterion by noise of a shape beside the white innovations, at its likeliest power."""
-    more = _POWERS[:, None] * shape
-    return float(np.max(np.sum(P * more / (1.0 + more) - np.log1p(more), axis=1))) * 2.0 / 1.5  # of a Hann window
 
 
 _SAME_AS = {
