@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ambid
+from ambid.estimation.colours import Colour, with_colours
 from ambid.estimation.linear import one_thread
 from ambid.job.data import load_bench
 from ambid.physics.rotor_model import RotorModel
@@ -16,7 +17,7 @@ from ambid.record import Record
 from ambid.rotor.conclusion import numbers_of
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Point
-from ambid.rotor.prediction import predict_rotor, predictor_problem, with_low_passes
+from ambid.rotor.prediction import predict_rotor, predictor_problem
 from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -72,7 +73,8 @@ def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
     at = Point(theta=theta, delays=np.array([1.0, 1.3, 2.2, 1.7]))
     at = replace(at, theta={**at.theta, "m": 0.6})
     white = predictor_problem(short, model, rig.parameters, at, free=(1, 2))
-    problem, vector = with_low_passes(*white, ((0, 300.0), (len(model.disturbances) + 1, 50.0)), 1.0)
+    colours = Colour(source="ax_force", omega=300.0), Colour(source="ay_position", omega=50.0)
+    problem, vector = with_colours(*white, colours, 1.0)
     work, weight = Workspace(problem), np.eye(8)
     slopes = linearise(problem, vector, weight, work)
     assert slopes is not None

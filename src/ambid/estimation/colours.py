@@ -163,23 +163,25 @@ def with_colours(
     return more, np.append(np.insert(vector, place, levels), np.zeros(sum(orders)))
 
 
-def coloured(fit: Fit, colours: Sequence[Colour], tick: Callable[[], None] | None = None) -> Fit | None:
-    """Fit again with coloured parts of one frequency and damping, at the likeliest; None where that does not settle, or
-    gains less than its numbers cost (BIC).
+def coloured(fit: Fit, choices: Sequence[Sequence[Colour]], tick: Callable[[], None] | None = None) -> Fit | None:
+    """Fit again with the likeliest of several choices of coloured parts of one frequency and damping, at the likeliest;
+    None where that does not settle, or gains less than its numbers cost (BIC).
     """
     before = fit if fit.problem.noise == "levels" else _with_levels(fit, tick)
-    best = _likeliest((with_colours(before.problem, before.vector, colours, over) for over in _OVER), np.inf, tick)
+    begun = (with_colours(before.problem, before.vector, colours, over) for colours, over in product(choices, _OVER))
+    best = _likeliest(begun, before.criterion, tick)
     for _ in range(_MOVES):
         if best is None:
             return None
-        more = _likeliest(_moved(best, len(colours)), best.criterion - 1.0, tick)
+        more = _likeliest(_moved(best, len(colours_of(fit.problem))), best.criterion - 1.0, tick)
         if more is None or not more.criterion < best.criterion:
             break
         best = more
     if best is None or best.status != "converged":
         return None
-    numbers = best.problem.slices["offset"].start - fit.problem.slices["offset"].start + colours[0].order
-    return best if fit.criterion - best.criterion > numbers * np.log(fit.problem.y.size) else None
+    numbers = best.problem.slices["offset"].start - fit.problem.slices["offset"].start
+    price = (numbers + colours_of(best.problem)[-1].order) * np.log(fit.problem.y.size)
+    return best if fit.criterion - best.criterion > price else None
 
 
 def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
@@ -191,11 +193,11 @@ def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     return search(problem, vector, tick=tick)
 
 
-def _moved(fit: Fit, count: int) -> Iterator[tuple[PredictorProblem, Array]]:
+def _moved(fit: Fit, kept: int) -> Iterator[tuple[PredictorProblem, Array]]:
     """Yield problems with the last colours elsewhere, and vectors for them: of the same power, or the same level."""
     problem = fit.problem
     assert isinstance(problem.model, Coloured)
-    rest, last = problem.model.colours[:-count], problem.model.colours[-count:]
+    rest, last = problem.model.colours[:kept], problem.model.colours[kept:]
     end = problem.slices["noise"].start + len(problem.model.disturbances)
     for by, wider in product(_FACTORS, _WIDTHS if last[0].damping else (1.0,)):
         if (by, wider) == (1.0, 1.0) or last[0].omega * by > np.pi * problem.rate_hz:
@@ -204,7 +206,7 @@ def _moved(fit: Fit, count: int) -> Iterator[tuple[PredictorProblem, Array]]:
         elsewhere = replace(problem, model=replace(problem.model, colours=(*rest, *moved)))
         for power in (0.0, 1.0):
             vector = fit.vector.copy()
-            vector[end - count : end] -= power * np.log(by * wider)
+            vector[end - len(last) : end] -= power * np.log(by * wider)
             yield elsewhere, vector
 
 

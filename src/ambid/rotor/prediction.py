@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.estimation.colours import Colour, Coloured, coloured, colours_of, with_colours
 from ambid.estimation.likelihood import (
     Fit,
-    Workspace,
-    evaluate,
     innovations,
     prior_rows,
     residual_blocks,
@@ -45,8 +44,6 @@ _WHOLE = 0.01  # samples by which a delay that is estimated may miss a whole num
 _ROUNDING = 1e-9
 _COLOURED = ("_force", "_voltage", "_position", "_current")  # kinds of sources
 _SLOWEST, _POLES = 4.0, 7  # pole of coloured noise times the record, that is tried first, and how many up to the rate
-_OVER = (0.0, 2.0, 4.0)  # logarithm of its level over that of the white part, at the start
-_FACTORS, _MOVES = (0.5, 0.7, 0.9, 1.1, 1.4, 2.0), 4  # of a pole, to find a likelier one, and how often
 _LEVEL = -2.0  # log level of disturbances at the start
 
 
@@ -64,8 +61,6 @@ class Searched:
 
     unknowns: Unknowns
     base: Point
-    # sources of noise (disturbances, then outputs) that have a low-pass part beside the white one, and its pole, rad/s
-    colours: tuple[tuple[int, float], ...] = ()
     name: str = "rotor"
     summary: str = "rotor by the numbers that are searched"
     parameters: tuple[ParameterSpec, ...] = field(default=())
@@ -87,19 +82,13 @@ class Searched:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Of the rotor, and what low passes hold."""
-        return (*self.rotor.states, *self.slow)
+        """Of the rotor."""
+        return self.rotor.states
 
     @property
     def disturbances(self) -> tuple[str, ...]:
-        """Of the rotor, and what drives low passes."""
-        return (*self.rotor.disturbances, *self.slow)
-
-    @property
-    def slow(self) -> list[str]:
-        """Low passes."""
-        sources = (*self.rotor.disturbances, *self.rotor.outputs)
-        return [f"{sources[of]}.slow{k}" for k, (of, _) in enumerate(self.colours)]
+        """Of the rotor."""
+        return self.rotor.disturbances
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -114,23 +103,7 @@ class Searched:
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return the rotor's matrices."""
         at = self.unknowns.unpack(self.vector(theta), self.base.theta, self.base.delays)[0]
-        return self._coloured(self.rotor.matrices(at))
-
-    def _coloured(self, space: StateSpace, *, slope: bool = False) -> StateSpace:
-        """Return matrices, or slopes of them, with low passes c' = p (d - c) of sources beside the rotor."""
-        if not self.colours:
-            return space
-        (n, n_d), k = space.E.shape, len(self.colours)
-        A, E = np.pad(space.A, (0, k)), np.pad(space.E, (0, k))
-        B, C = np.pad(space.B, ((0, k), (0, 0))), np.pad(space.C, ((0, 0), (0, k)))
-        for j, (of, pole) in enumerate(self.colours):
-            if of < n_d:
-                A[:n, n + j] = space.E[:, of]
-            elif not slope:
-                C[of - n_d, n + j] = 1.0
-            if not slope:
-                A[n + j, n + j], E[n + j, n_d + j] = -pole, pole
-        return StateSpace(A=A, B=B, E=E, C=C)
+        return self.rotor.matrices(at)
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return the rotor's derivative by the chain rule."""
@@ -140,7 +113,7 @@ class Searched:
         column = chain[: len(names), self.unknowns.names.index(parameter)]
         parts = [(x, self.rotor.derivative(at, name)) for name, x in zip(names, column.tolist(), strict=True) if x]
         A, B, E, C = (sum(x * getattr(d, which) for x, d in parts) for which in "ABEC")
-        return self._coloured(StateSpace(A=A, B=B, E=E, C=C), slope=True)
+        return StateSpace(A=A, B=B, E=E, C=C)
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return one for what may be zero: it is over its size already."""
@@ -176,22 +149,19 @@ class _Erring(Searched):
                 k = self.outputs.index(error.channel)
                 row = {"gain": space.C[k], "lag": -space.C[k] @ space.A}
                 moved.C[k] += row[error.kind] if error.kind in row else space.C[self.outputs.index(error.other)]
-        return self._coloured(moved, slope=True)
+        return moved
 
 
 def predictor_scores(found: PredictorFit) -> list[Score]:
     """Return the causes that the innovations may have: fixed numbers, gains, cross-talk, lags."""
-    fit, searched = found.fit, found.fit.problem.model
-    assert isinstance(searched, Searched)
+    fit, searched = found.fit, searched_of(found.fit)
     causes = {c.name: c for c in causes_of(searched.unknowns) if c.errors}
     old, n, more = fit.problem, fit.problem.n_physical, len(causes)
-    erring = _Erring(
-        unknowns=searched.unknowns, base=searched.base, colours=searched.colours, causes=causes,
-    )  # fmt: skip
+    erring = _Erring(unknowns=searched.unknowns, base=searched.base, causes=causes)
     problem = replace(
-        old, model=erring, estimated=(*old.estimated, *causes), magnitude=np.append(old.magnitude, np.ones(more)),
+        old, model=Coloured(plain=erring, colours=colours_of(old)), estimated=(*old.estimated, *causes),
+        magnitude=np.append(old.magnitude, np.ones(more)), joint_priors=None,
         prior_mean=np.append(old.prior_mean, np.zeros(more)), prior_sd=np.append(old.prior_sd, np.full(more, np.inf)),
-        joint_priors=None,
     )  # fmt: skip
     weight, vector = weight_of(fit.covariance), np.insert(fit.vector, n, np.zeros(more))
     late, first, parts = _late_columns(fit, tuple(causes.values())), 0, list[Array]()
@@ -267,7 +237,7 @@ def predict_rotor(
             scales = last.problem.scales
             rest = scales.disturbance[: len(model.disturbances)]
             problem = replace(problem, scales=replace(scales, state=problem.scales.state, disturbance=rest))
-            problem, vector = with_low_passes(problem, vector, searched_of(last).colours)
+            problem, vector = with_colours(problem, vector, colours_of(last.problem))
             vector[problem.slices["noise"]] = last.vector[last.problem.slices["noise"]]
         return problem, vector
 
@@ -322,66 +292,19 @@ def predictor_problem(
     return problem, vector
 
 
-def with_low_passes(
-    problem: PredictorProblem, vector: Array, colours: tuple[tuple[int, float], ...], over: float = 0.0
-) -> tuple[PredictorProblem, Array]:
-    """Return a problem with further low passes, and its vector with their log levels `over` those of their sources."""
-    searched, scales, k = problem.model, problem.scales, len(colours)
-    assert isinstance(searched, Searched)
-    of, n_d, end = [j for j, _ in colours], len(searched.rotor.disturbances), len(searched.disturbances)
-    slow = np.concatenate([scales.disturbance[:n_d], scales.output])[of]
-    noise = vector[problem.slices["noise"]]
-    levels = np.concatenate([noise[:n_d], [0.0], noise[end:]])[of] + over
-    more = replace(
-        problem, model=replace(searched, colours=(*searched.colours, *colours)), unsteady=problem.unsteady + k,
-        scales=replace(scales, state=np.append(scales.state, slow), disturbance=np.append(scales.disturbance, slow)),
-        noise_center=np.insert(problem.noise_center, end, np.full(k, _LEVEL)),
-    )  # fmt: skip
-    return more, np.append(np.insert(vector, problem.slices["noise"].start + end, levels), np.zeros(k))
-
-
 def _coloured(fit: Fit, causes_of: Callable[[Fit], list[Score]], tick: Callable[[], None]) -> Fit:
     """Return a fit whose noise has low-pass parts of one pole in all sources of a kind, kind after kind, where the
     likelihood wants them, and more than it wants any cause that the innovations may have.
     """
-    searched, poles = searched_of(fit), np.geomspace(_SLOWEST / fit.problem.n_used, 1.0, _POLES) * fit.problem.rate_hz
-    sources = (*searched.rotor.disturbances, *searched.outputs)
-    kinds = [[k for k, s in enumerate(sources) if q in s] for q in _COLOURED]
+    rotor, poles = _rotor_of(fit), np.geomspace(_SLOWEST / fit.problem.n_used, 1.0, _POLES) * fit.problem.rate_hz
+    kinds = [[s for s in (*rotor.disturbances, *rotor.outputs) if kind in s] for kind in _COLOURED]
     while True:
-        had = {k for k, _ in searched_of(fit).colours}
-        trials = list[tuple[float, PredictorProblem, Array]]()
-        for kind, pole in product((x for x in kinds if x and had.isdisjoint(x)), poles.tolist()):
-            pairs = [with_low_passes(fit.problem, fit.vector, tuple((k, pole) for k in kind), x) for x in _OVER]
-            work = Workspace(pairs[0][0])
-            trials += [(evaluate(q, v, work)[0], q, v) for q, v in pairs]
-        value, problem, vector = min(trials, key=lambda t: t[0], default=(np.inf, fit.problem, fit.vector))
-        if not value < fit.criterion:
-            return fit
-        more = _with_poles(search(problem, vector, tick=tick), len(searched.rotor.disturbances), tick)
-        price = (len(problem.model.disturbances) - len(fit.problem.model.disturbances) + 1) * np.log(fit.problem.y.size)
-        gain = fit.criterion - more.criterion
-        if more.status == "failed" or not gain > max([price, *(s.gain for s in causes_of(fit)[:1])]):
+        had = {c.source for c in colours_of(fit.problem)}
+        left = [x for x in kinds if x and had.isdisjoint(x)]
+        more = coloured(fit, [[Colour(source=s, omega=p) for s in x] for x, p in product(left, poles.tolist())], tick)
+        if more is None or not fit.criterion - more.criterion > max((s.gain for s in causes_of(fit)[:1]), default=0.0):
             return fit
         fit = more
-
-
-def _with_poles(fit: Fit, n_d: int, tick: Callable[[], None]) -> Fit:
-    """Return a fit at the pole of its last low passes that is likeliest."""
-    for _ in range(_MOVES):
-        searched, trials = searched_of(fit), list[tuple[float, PredictorProblem, Array]]()
-        colours, last = searched.colours, searched.colours[-1][1]
-        own = [k for k, (_, pole) in enumerate(colours) if pole == last]
-        places = [fit.problem.slices["noise"].start + n_d + k for k in own]
-        for factor, asymptote in product(_FACTORS, (0.0, 1.0)):
-            moved = tuple((of, p * factor if k in own else p) for k, (of, p) in enumerate(colours))
-            problem, v = replace(fit.problem, model=replace(searched, colours=moved)), fit.vector.copy()
-            v[places] -= asymptote * np.log(factor)
-            trials.append((evaluate(problem, v, fit.work)[0], problem, v))
-        value, problem, vector = min(trials, key=lambda t: t[0])
-        if not value < fit.criterion - 1.0:
-            break
-        fit = search(problem, vector, tick=tick)
-    return fit
 
 
 def _joint_priors(searched: Searched) -> Callable[[Array], tuple[Array, Array]]:
@@ -460,7 +383,8 @@ def _late(u: Array, delays: NDArray[np.intp]) -> Array:
 
 def searched_of(fit: Fit) -> Searched:
     """Return the model of a fit."""
-    searched = fit.problem.model
+    model = fit.problem.model
+    searched = model.plain if isinstance(model, Coloured) else model
     assert isinstance(searched, Searched)
     return searched
 
@@ -472,8 +396,7 @@ def _rotor_of(fit: Fit) -> RotorModel:
 
 def _point_of(fit: Fit) -> Point:
     """Return the rotor's numbers and delays of a fit."""
-    problem, searched = fit.problem, fit.problem.model
-    assert isinstance(searched, Searched)
+    problem, searched = fit.problem, searched_of(fit)
     vector = np.concatenate(
         [fit.vector[: problem.n_physical], searched.base.delays[list(searched.unknowns.free_delays)]]
     )
@@ -486,8 +409,7 @@ def _point_of(fit: Fit) -> Point:
 
 def _ended(fit: Fit, spectra: PeriodSpectra, speed: float) -> PredictorFit:
     """Return the end of a search by the unknowns: numbers of noise, offsets and first state are taken out by QR."""
-    problem, searched = fit.problem, fit.problem.model
-    assert isinstance(searched, Searched)
+    problem, searched = fit.problem, searched_of(fit)
     n = problem.slices["fraction"].stop
     rows = np.vstack([np.column_stack([fit.J, np.zeros(len(fit.J))]), np.column_stack([fit.J_prior, -fit.r_prior])])
     order = [*range(n, problem.size), *range(n), problem.size]

@@ -230,7 +230,7 @@ def extended(
         return more[0], plain, more[1]
     noises = [c.colour for c in found if c.colour and (c in strong or c.name == cause.name)]
     noises += [c.colour for c in found if c.colour and c.channel == cause.channel and c.colour not in noises]
-    louder = next((better for colour in noises if (better := coloured(fit, [colour])) is not None), None)
+    louder = next((better for colour in noises if (better := coloured(fit, [[colour]])) is not None), None)
     if louder is None:
         return None
     plain = replace(louder.problem, y=plain.y, extra=plain.extra)

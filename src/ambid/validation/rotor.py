@@ -15,6 +15,7 @@ from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.bearing.sizes import check_units
 from ambid.bearing.uncertainty import noise_levels
+from ambid.estimation.colours import colours_of
 from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.likelihood import Fit, innovations
 from ambid.estimation.predictor import assemble
@@ -59,24 +60,22 @@ def of_predictor(found: PredictorFit) -> Evidence:
 
 def _told(check: Check, fit: Fit) -> Check:
     """Return a check of noise that says what colour it has in the model."""
-    searched = searched_of(fit)
-    sources = (*searched.rotor.disturbances, *searched.outputs)
-    poles = {sources[of].rpartition("_")[2].rstrip("0123456789"): pole / (2.0 * np.pi) for of, pole in searched.colours}
+    poles = {c.source.rpartition("_")[2].rstrip("0123456789"): c.frequency_hz for c in colours_of(fit.problem)}
     words = " and ".join(f"noise of each {kind} has a low-pass part of {pole:.3g} Hz" for kind, pole in poles.items())
     return replace(check, detail=f"{check.detail}; {words}") if words else check
 
 
 def _noise(fit: Fit) -> dict[str, float]:
     """Return the rms of every source, SI: of its white part and its low-pass ones."""
-    problem, searched = fit.problem, searched_of(fit)
+    problem, plain = fit.problem, searched_of(fit)
     predictor = assemble(problem, fit.vector, with_derivatives=False)
     assert predictor is not None
     disturbance, sensor = noise_levels(fit, predictor)
     rms = {**sensor, **disturbance}
-    sources = (*searched.rotor.disturbances, *searched.outputs)
-    square = {name: rms[name] ** 2 for name in (*searched.outputs, *searched.rotor.disturbances)}
-    for (of, pole), name in zip(searched.colours, searched.slow, strict=True):  # held noise through a low pass
-        square[sources[of]] += rms[name] ** 2 * np.tanh(0.5 * pole / problem.rate_hz)
+    square = {name: rms[name] ** 2 for name in (*plain.outputs, *plain.disturbances)}
+    driving = problem.model.disturbances[len(plain.disturbances) :]
+    for colour, name in zip(colours_of(problem), driving, strict=True):  # held noise through a low pass
+        square[colour.source] += rms[name] ** 2 * np.tanh(0.5 * colour.omega / problem.rate_hz)
     return {name: float(np.sqrt(x)) for name, x in square.items()}
 
 
@@ -110,7 +109,7 @@ def _line_check(e: Array, found: PredictorFit, rate_hz: float) -> dict[str, Chec
         return {}
     frequency, channel = float(frequencies[j]), found.model.outputs[int(np.argmax(power[j]))]
     # a predictor of coloured noise takes part of a line to other channels
-    most = "" if searched_of(found.fit).colours else f", most in {channel}"
+    most = "" if colours_of(found.fit.problem) else f", most in {channel}"
     check = Check(
         passed=False, cause="line", size=frequency, alternatives=("mode",),
         detail=f"a line at {frequency:.4g} Hz stands in the innovations{most}: hum, motion of the base, a "
