@@ -18,9 +18,9 @@ from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 
 _LEVEL = -2.0  # centre of the weak prior on the log level
 _OVER = (-4.0, -2.0, 0.0, 2.0, 4.0)  # logarithm of its level over that of the white part, at the start
-_FACTORS = (0.7, 0.85, 0.97, 1.0, 1.03, 1.15, 1.4)  # of a frequency, to find a likelier one
-_WIDTHS = (0.5, 0.8, 1.0, 1.25, 2.0)  # and of a damping
-_MOVES = 6
+_FACTORS = (0.2, 0.5, 0.8, 0.97, 1.03, 1.25, 2.0, 5.0)  # of a frequency, to find a likelier one
+_WIDTHS = (0.5, 0.8, 1.25, 2.0)  # and of a damping
+_MOVES = 8
 _RISE = 4.0  # of the criterion, to the end of what a record allows
 _STEP, _FARTHEST = 0.25, 5.0  # logarithms of the first move of a place, and of the last
 _SOON = 15  # steps of a search beside
@@ -170,14 +170,10 @@ def coloured(fit: Fit, choices: Sequence[Sequence[Colour]], tick: Callable[[], N
     before = fit if fit.problem.noise == "levels" else _with_levels(fit, tick)
     begun = (with_colours(before.problem, before.vector, colours, over) for colours, over in product(choices, _OVER))
     best = _likeliest(begun, before.criterion, tick)
-    for _ in range(_MOVES):
-        if best is None:
-            return None
-        more = _likeliest(_moved(best, len(colours_of(fit.problem))), best.criterion - 1.0, tick)
-        if more is None or not more.criterion < best.criterion:
-            break
-        best = more
-    if best is None or best.status != "converged":
+    if best is None:
+        return None
+    best = resettled(best, range(len(colours_of(fit.problem)), len(colours_of(best.problem))), tick)
+    if best.status != "converged":
         return None
     numbers = best.problem.slices["offset"].start - fit.problem.slices["offset"].start
     price = (numbers + colours_of(best.problem)[-1].order) * np.log(fit.problem.y.size)
@@ -193,52 +189,64 @@ def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     return search(problem, vector, tick=tick)
 
 
-def _moved(fit: Fit, kept: int) -> Iterator[tuple[PredictorProblem, Array]]:
-    """Yield problems with the last colours elsewhere, and vectors for them: of the same power, or the same level."""
+def resettled(fit: Fit, which: Sequence[int], tick: Callable[[], None] | None = None) -> Fit:
+    """Return a fit with some of its colours, which have one frequency and damping, where they are likeliest."""
+    for _ in range(_MOVES):
+        more = _likeliest(_moved(fit, which), fit.criterion - 1.0, tick)
+        if more is None or not more.criterion < fit.criterion:
+            break
+        fit = more
+    return fit
+
+
+def _moved(fit: Fit, which: Sequence[int]) -> Iterator[tuple[PredictorProblem, Array]]:
+    """Yield problems with some colours elsewhere, and vectors for them: of the same power, or the same level."""
     problem = fit.problem
     assert isinstance(problem.model, Coloured)
-    rest, last = problem.model.colours[:kept], problem.model.colours[kept:]
-    end = problem.slices["noise"].start + len(problem.model.disturbances)
-    for by, wider in product(_FACTORS, _WIDTHS if last[0].damping else (1.0,)):
-        if (by, wider) == (1.0, 1.0) or last[0].omega * by > np.pi * problem.rate_hz:
+    colours, first = problem.model.colours, problem.slices["noise"].start + len(problem.model.plain.disturbances)
+    one = colours[which[0]]
+    for by, wider in [(by, 1.0) for by in _FACTORS] + [(1.0, wider) for wider in _WIDTHS if one.damping]:
+        if one.omega * by > np.pi * problem.rate_hz:
             continue
-        moved = (replace(c, omega=c.omega * by, damping=c.damping and c.damping * wider) for c in last)
-        elsewhere = replace(problem, model=replace(problem.model, colours=(*rest, *moved)))
+        moved = list(colours)
+        for k in which:
+            c = colours[k]
+            moved[k] = replace(c, omega=c.omega * by, damping=c.damping and c.damping * wider)
+        elsewhere = replace(problem, model=replace(problem.model, colours=tuple(moved)))
         for power in (0.0, 1.0):
             vector = fit.vector.copy()
-            vector[end - len(last) : end] -= power * np.log(by * wider)
+            vector[[first + k for k in which]] -= power * np.log(by * wider)
             yield elsewhere, vector
 
 
 def left_open(fit: Fit) -> Array:
-    """Return what the places of coloured parts, known no better than the record shows them, add to the covariance of
-    the physical parameters, (n_physical, n_physical), over their magnitudes: a force that walks and a stiffness take
-    each other's place, along curves that a local covariance does not see. Each place is moved until the criterion,
-    all else fitted again, has risen by `_RISE`; a step over the root of its rise is one standard deviation.
+    """Return what the corners of low passes of disturbances, known no better than the record shows them, add to the
+    covariance of the physical parameters, (n_physical, n_physical), over their magnitudes: a force that walks and a
+    stiffness take each other's place, along a curve that a local covariance does not see. Each corner is moved until
+    the criterion, all else fitted again, has risen by `_RISE`; a step over the root of its rise is one standard
+    deviation.
     """
     problem, n = fit.problem, fit.problem.n_physical
     total = np.zeros((n, n))
     for j, colour in enumerate(colours_of(problem)):
-        for what in ("omega", "damping")[: colour.order]:
-            steps, work = [np.zeros(n)], fit.work
-            for way in (-1.0, 1.0):
-                near, by = fit.vector, _STEP
-                while by < _FARTHEST:
-                    moved = replace(colour, **{what: getattr(colour, what) * np.exp(way * by)})
-                    there = _at(problem, j, moved)
-                    if moved.omega > np.pi * problem.rate_hz:
-                        break
-                    again = search(there, near, steps=_SOON, work=None if work is None else work.of(there))
-                    rise = again.criterion - fit.criterion
-                    if not rise < np.inf:
-                        break
-                    near = again.vector
-                    steps.append((near[:n] - fit.vector[:n]) / np.sqrt(max(rise, 1.0)))
-                    if rise > _RISE:
-                        break
-                    by *= 2.0
-            far = np.array(steps)[np.argmax(np.sum((np.array(steps) @ _whitener(fit)) ** 2, axis=1))]
-            total += np.outer(far, far)
+        if colour.damping is not None or colour.source in problem.model.outputs:
+            continue
+        steps, work = [np.zeros(n)], fit.work
+        for way in (-1.0, 1.0):
+            near, by = fit.vector, _STEP
+            while by < _FARTHEST and colour.omega * np.exp(way * by) < np.pi * problem.rate_hz:
+                there = _at(problem, j, replace(colour, omega=colour.omega * np.exp(way * by)))
+                again = search(there, near, steps=_SOON, work=None if work is None else work.of(there))
+                rise = again.criterion - fit.criterion
+                if not rise < np.inf:
+                    break
+                near = again.vector
+                steps.append((near[:n] - fit.vector[:n]) / np.sqrt(max(rise, 1.0)))
+                if rise > _RISE:
+                    break
+                by *= 2.0
+        far = np.array(steps)[np.argmax(np.sum((np.array(steps) @ _whitener(fit)) ** 2, axis=1))]
+        total += np.outer(far, far)
     return total
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.bearing.uncertainty import farthest
 from ambid.estimation.calibration import explaining, lines_of
-from ambid.estimation.colours import Colour, coloured, colours_of, left_open, likely_colours
+from ambid.estimation.colours import Colour, coloured, colours_of, left_open, likely_colours, resettled
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import (
@@ -227,15 +227,30 @@ def extended(
         more = _with_causes(fit, means, plain, taken, (cause, *alike.values()))
         more = _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
     if more is not None:
-        return more[0], plain, more[1]
-    noises = [c.colour for c in found if c.colour and (c in strong or c.name == cause.name)]
-    noises += [c.colour for c in found if c.colour and c.channel == cause.channel and c.colour not in noises]
-    louder = next((better for colour in noises if (better := coloured(fit, [[colour]])) is not None), None)
+        return _resettled(more[0], means, plain, more[1])
+    noises = [[c.colour] for c in found if c.colour and (c in strong or c.channel == cause.channel)]
+    louder = coloured(fit, noises) if noises else None
     if louder is None:
         return None
-    plain = replace(louder.problem, y=plain.y, extra=plain.extra)
-    again = _with_causes(louder, means, plain, taken, ()) if taken else (replace(louder, beside=left_open(louder)), ())
-    return None if again is None else (again[0], plain, again[1])
+    return _resettled(louder, means, plain, taken)
+
+
+def _resettled(
+    fit: Fit, means: Mapping[str, float], plain: PredictorProblem, taken: Sequence[Cause]
+) -> tuple[Fit, PredictorProblem, tuple[Cause, ...]] | None:
+    """Return a fit, with its colours where they are likeliest beside the causes that it holds, and what is left open
+    by both.
+    """
+    for k in range(len(colours_of(fit.problem))):
+        fit = resettled(fit, [k])
+    if fit.problem.model is not plain.model:
+        plain = replace(fit.problem, y=plain.y, extra=plain.extra)
+        again = _with_causes(fit, means, plain, taken, ()) if taken else (replace(fit, beside=None), ())
+        if again is None:
+            return None
+        fit, taken = again
+    open_ = left_open(fit)
+    return replace(fit, beside=open_ if fit.beside is None else fit.beside + open_), plain, tuple(taken)
 
 
 def _with_causes(
@@ -256,7 +271,7 @@ def _with_causes(
         left = _tested(look, [("", tuple(columns))])[0]
         step = np.split(left.sizes, np.cumsum([c.sizes.size for c in parts])[:-1])
         if left.gain < _SETTLED and fit.status == "converged":
-            return replace(fit, beside=_beside(look, columns) + left_open(fit)), tuple(parts)
+            return replace(fit, beside=_beside(look, columns)), tuple(parts)
     return None
 
 
