@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.colours import without_colours
+from ambid.estimation.colours import colours_of, without_colours
 from ambid.estimation.estimate import Check, Continuous, Delay, Estimate, EstimatedParameter, NoiseModel, OutputFit
 from ambid.estimation.likelihood import (
     Fit,
@@ -162,7 +162,8 @@ def _left_open(fit: Fit) -> Array:
     n, extra = problem.n_physical, np.zeros((problem.n_physical, problem.n_physical))
     if problem.noise != "levels" or predictor is None or stable(predictor.A):
         return extra
-    slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
+    own = sum(c.order for c in colours_of(problem))  # what colours forget slowly is counted by their places
+    slowest = np.sort(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))[-1 - own]
     memories = problem.n_used * (1.0 - slowest)
     if memories > _LONG:
         return extra
