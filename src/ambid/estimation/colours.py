@@ -4,7 +4,7 @@ more source of a disturbance or of a sensor's error (Ljung 1999, sec. 4.2; Ander
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -18,14 +18,13 @@ from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 
 _LEVEL = -2.0  # centre of the weak prior on the log level
 _OVER = (-4.0, -2.0, 0.0, 2.0, 4.0)  # logarithm of its level over that of the white part, at the start
-_FACTORS = (0.2, 0.5, 0.8, 0.97, 1.03, 1.25, 2.0, 5.0)  # of a frequency, to find a likelier one
-_WIDTHS = (0.5, 0.8, 1.25, 2.0)  # and of a damping
-_MOVES = 8
+_SHAPE = ("colour.omega", "colour.damping")  # names of their logarithms, over those at the start
 _RISE = 4.0  # of the criterion, to the end of what a record allows
-_STEP, _FARTHEST = 0.25, 5.0  # logarithms of the first move of a place, and of the last
+_STEP, _FARTHEST = 0.25, 5.0  # logarithms of the first move of a corner, and of the last
 _SOON = 15  # steps of a search beside
 _PLACES = 9  # corners of low passes, and widths of resonances, that are looked at
 _POWERS = np.geomspace(0.1, 1e6, 12)  # of coloured noise over white, where it stands highest
+_REACH = 2.0  # standard deviation of the weak prior on these
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,6 +130,37 @@ class Coloured:
         return wide
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Shaped(Coloured):
+    """The same with frequency and damping, as `_SHAPE`, of some colours together as further numbers."""
+
+    which: tuple[int, ...]
+
+    def at(self, theta: Mapping[str, float]) -> tuple[Coloured, dict[str, float]]:
+        """Return the model with the colours there, and its own numbers."""
+        by, wider = (float(np.exp(theta.get(name, 0.0))) for name in _SHAPE)
+        colours = list(self.colours)
+        for k in self.which:
+            c = colours[k]
+            colours[k] = replace(c, omega=c.omega * by, damping=c.damping and c.damping * wider)
+        return Coloured(plain=self.plain, colours=tuple(colours)), {k: x for k, x in theta.items() if k not in _SHAPE}
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return the matrices there."""
+        model, own = self.at(theta)
+        return model.matrices(own)
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return the derivative: the rows of a colour are proportional to its frequency, its damped ones to both."""
+        model, own = self.at(theta)
+        if parameter not in _SHAPE:
+            return model.derivative(own, parameter)
+        space, of = model.matrices(own), np.repeat(np.arange(len(self.colours)), [c.order for c in self.colours])
+        A = space.A if parameter == _SHAPE[0] else np.diag(np.diag(space.A))
+        rows = np.append(np.zeros(len(self.plain.states), dtype=bool), np.isin(of, self.which))[:, None]
+        return StateSpace(A=A * rows, B=0.0 * space.B, E=space.E * rows, C=0.0 * space.C)
+
+
 def colours_of(problem: PredictorProblem) -> tuple[Colour, ...]:
     """Return the coloured parts of a problem's noise."""
     return problem.model.colours if isinstance(problem.model, Coloured) else ()
@@ -168,16 +198,48 @@ def coloured(fit: Fit, choices: Sequence[Sequence[Colour]], tick: Callable[[], N
     None where that does not settle, or gains less than its numbers cost (BIC).
     """
     before = fit if fit.problem.noise == "levels" else _with_levels(fit, tick)
-    begun = (with_colours(before.problem, before.vector, colours, over) for colours, over in product(choices, _OVER))
-    best = _likeliest(begun, before.criterion, tick)
-    if best is None:
+    least, begun, work = before.criterion, None, None
+    for colours, over in product(choices, _OVER):
+        problem, vector = with_colours(before.problem, before.vector, colours, over)
+        work = Workspace(problem) if work is None else work.of(problem)
+        value = evaluate(problem, vector, work)[0]
+        least, begun = (value, (problem, vector)) if value < least else (least, begun)
+    had = len(colours_of(fit.problem))
+    more = None if begun is None else _shaped(*begun, range(had, len(colours_of(begun[0]))), tick)
+    if more is None or more.status != "converged":
         return None
-    best = resettled(best, range(len(colours_of(fit.problem)), len(colours_of(best.problem))), tick)
-    if best.status != "converged":
-        return None
-    numbers = best.problem.slices["offset"].start - fit.problem.slices["offset"].start
-    price = (numbers + colours_of(best.problem)[-1].order) * np.log(fit.problem.y.size)
-    return best if fit.criterion - best.criterion > price else None
+    numbers = more.problem.slices["offset"].start - fit.problem.slices["offset"].start
+    price = (numbers + colours_of(more.problem)[-1].order) * np.log(fit.problem.y.size)
+    return more if fit.criterion - more.criterion > price else None
+
+
+def resettled(fit: Fit, which: int) -> Fit:
+    """Return a fit with one of its colours where it is likeliest."""
+    again = _shaped(fit.problem, fit.vector, [which], None)
+    return again if again.status == "converged" and again.criterion < fit.criterion - 1.0 else fit
+
+
+def _shaped(problem: PredictorProblem, vector: Array, which: Sequence[int], tick: Callable[[], None] | None) -> Fit:
+    """Search with frequency and damping of some colours free, which have one, then with them where they are."""
+    n, begun, priors = problem.n_physical, problem.model, problem.joint_priors
+    assert isinstance(begun, Coloured)
+    names = _SHAPE[: begun.colours[which[0]].order]
+    k = len(names)
+
+    def joint(values: Array) -> tuple[Array, Array]:
+        assert priors is not None
+        slopes, left = priors(values[:n])
+        return np.pad(slopes, ((0, 0), (0, k))), left
+
+    model = _Shaped(plain=begun.plain, colours=begun.colours, which=tuple(which))
+    free = replace(
+        problem, model=model, estimated=(*problem.estimated, *names), joint_priors=priors and joint,
+        magnitude=np.append(problem.magnitude, np.ones(k)), prior_mean=np.append(problem.prior_mean, np.zeros(k)),
+        prior_sd=np.append(problem.prior_sd, np.full(k, _REACH)),
+    )  # fmt: skip
+    found = search(free, np.insert(vector, n, np.zeros(k)), tick=tick)
+    there = replace(problem, model=model.at(free.parameters(found.vector))[0])
+    return search(there, np.delete(found.vector, slice(n, n + k)), tick=tick, work=found.work)
 
 
 def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
@@ -187,36 +249,6 @@ def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     for group, there in problem.slices.items():
         vector[there] = problem.noise_center if group == "noise" else fit.vector[own[group]]
     return search(problem, vector, tick=tick)
-
-
-def resettled(fit: Fit, which: Sequence[int], tick: Callable[[], None] | None = None) -> Fit:
-    """Return a fit with some of its colours, which have one frequency and damping, where they are likeliest."""
-    for _ in range(_MOVES):
-        more = _likeliest(_moved(fit, which), fit.criterion - 1.0, tick)
-        if more is None or not more.criterion < fit.criterion:
-            break
-        fit = more
-    return fit
-
-
-def _moved(fit: Fit, which: Sequence[int]) -> Iterator[tuple[PredictorProblem, Array]]:
-    """Yield problems with some colours elsewhere, and vectors for them: of the same power, or the same level."""
-    problem = fit.problem
-    assert isinstance(problem.model, Coloured)
-    colours, first = problem.model.colours, problem.slices["noise"].start + len(problem.model.plain.disturbances)
-    one = colours[which[0]]
-    for by, wider in [(by, 1.0) for by in _FACTORS] + [(1.0, wider) for wider in _WIDTHS if one.damping]:
-        if one.omega * by > np.pi * problem.rate_hz:
-            continue
-        moved = list(colours)
-        for k in which:
-            c = colours[k]
-            moved[k] = replace(c, omega=c.omega * by, damping=c.damping and c.damping * wider)
-        elsewhere = replace(problem, model=replace(problem.model, colours=tuple(moved)))
-        for power in (0.0, 1.0):
-            vector = fit.vector.copy()
-            vector[[first + k for k in which]] -= power * np.log(by * wider)
-            yield elsewhere, vector
 
 
 def left_open(fit: Fit) -> Array:
@@ -285,21 +317,6 @@ def without_colours(fit: Fit) -> Fit:
     level = problem.slices["noise"].start + white
     vector = np.delete(fit.vector, slice(level, level + n_c))[n : n + alone.size]
     return search(alone, vector)
-
-
-def _likeliest(
-    trials: Iterable[tuple[PredictorProblem, Array]], above: float, tick: Callable[[], None] | None
-) -> Fit | None:
-    """Search from the likeliest of several problems; None where none is below a criterion."""
-    least, at, work = np.inf, None, None
-    for problem, vector in trials:
-        work = Workspace(problem) if work is None else work.of(problem)
-        value = evaluate(problem, vector, work)[0]
-        least, at = (value, (problem, vector)) if value < least else (least, at)
-    if at is None or not least < above:
-        return None
-    fit = search(*at, tick=tick, work=work)
-    return None if fit.status == "failed" else fit
 
 
 def likely_colours(source: str, power: Array, way: Array, frequency_hz: Array) -> list[tuple[float, Colour]]:

@@ -242,7 +242,7 @@ def _resettled(
     by both.
     """
     for k in range(len(colours_of(fit.problem))):
-        fit = resettled(fit, [k])
+        fit = resettled(fit, k)
     if fit.problem.model is not plain.model:
         plain = replace(fit.problem, y=plain.y, extra=plain.extra)
         again = _with_causes(fit, means, plain, taken, ()) if taken else (replace(fit, beside=None), ())
