@@ -13,8 +13,9 @@ from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.job.data import load_bench, signals_of
+from ambid.physics.presets import preset
 from ambid.record import Channel, Record
-from ambid.rig import default_rig
+from ambid.rig import default_rig, rig_of_preset
 from ambid.validation.facts import agreements, belonging, between_samples, facts, informed, mean_resistance, one_sided
 
 RATE = 1000.0
@@ -41,6 +42,30 @@ def test_means_of_a_current_with_one_sign_give_the_resistance():
     value, sd = mean_resistance(carried())
     assert abs(value - 4.0) < 2 * sd < 0.15
     assert mean_resistance(carried(offset=0.4))[0] == pytest.approx(4.4, abs=0.02)
+
+
+def test_a_fixed_resistance_that_the_means_contradict_is_named():
+    """However far it is, and first; beside an offset that makes the means it stands, as the record shows it."""
+    ball, bench = ambid.simulate("levitated-ball", duration=2.0, seed=1), preset("levitated-ball")
+    rig = rig_of_preset(bench)
+    wrong = [replace(p, role="fixed", value=2.52) if p.name == "R" else p for p in rig.parameters]
+    reasons = ambid.identify(ball, replace(rig, parameters=tuple(wrong))).verdict.reasons
+    assert (reasons[0].check, reasons[0].cause, reasons[0].alternatives) == ("ohm", "fixed_value", ("ohm",))
+
+    known = {k: sd for k, sd in SD.items() if k != "R"}
+    theta = {**THETA, "R": 2.4}
+    for step, passed in ((1.6, False), (0.01, True)):
+        freed = {"R": ((step / 0.01) ** 2, np.array([0.0, step]))}
+        assert agreements(carried(), default_rig(), theta, known, known, freed)["ohm"].passed is passed
+    assert not agreements(carried(), default_rig(), theta, known, known)["ohm"].passed
+
+
+def test_belonging_of_a_short_record_is_not_tested():
+    short = carried(n=239)
+    assert belonging(short).passed
+    assert belonging(short).p is None
+    assert "not tested" in belonging(short).detail
+    assert belonging(carried(n=240)).p is not None
 
 
 def test_means_of_opposite_signs_are_contradicted_before_any_fit():

@@ -348,7 +348,7 @@ def _judged(
     facts: Mapping[str, Check] = {}
     used, alone = None, spread.information
     if problem.model.name == "one-axis":
-        facts = physical.fact_checks(fit, rig, bench, spread, robust=robust)
+        facts = physical.fact_checks(fit, rig, bench, spread, robust=robust, freed=freed)
         fit, spread, used = informed(fit, rig, bench, {**checks, **facts}, spread, robust=robust)
         if used is not None:
             text = f"{facts['gravity_balance'].detail}. The estimate uses it"

@@ -22,7 +22,7 @@ from ambid.arrays import Array
 from ambid.bearing.uncertainty import Uncertainty, farthest
 from ambid.estimation.calibration import explaining, lines_of
 from ambid.estimation.estimate import Check
-from ambid.estimation.likelihood import Fit, evaluate, workspace_near
+from ambid.estimation.likelihood import Fit, Freed, evaluate, workspace_near
 from ambid.estimation.uncertainty import chi_squared_tail, natural_sizes
 from ambid.record import Record
 from ambid.rig import Rig
@@ -35,7 +35,7 @@ _STAGE = 0.1  # of the mean voltage that a power stage may drop or add
 _SHARP, _OFFSETS = 0.02, 0.5  # R known so well (sd over R) and so far from the means is not of the same mean current
 _BLOCKS = 30  # stretches whose means show the scatter of a mean
 _PAST, _LAGS = 20, 40  # samples that whiten a signal, and between which two are compared
-_LONGEST = 40_000  # samples that are compared
+_ENOUGH, _LONGEST = 4 * (_PAST + _LAGS), 40_000  # samples that are compared, at least and at most
 _CHANCE = 1e-3  # probability above which a relation may be chance
 _SHOWN = 3.0  # standard deviations of k_i above which current and position belong together, of L current and voltage
 _STILL = 4  # samples in which no channel changes: the log stood still
@@ -117,13 +117,14 @@ def belonging(record: Record, *, coil: bool = False) -> Check:
     """Check that each of position, current and voltage is related to another of them beyond chance; of the latter two
     it may be known that one `coil` has both.
     """
+    if record.n_samples < _ENOUGH:
+        detail = f"whether position and current are of one run was not tested: less than {_ENOUGH} samples"
+        return Check(passed=True, detail=detail)
     names = [name for name in ("position", "current", "voltage") if name in record.names]
-    chance = dict.fromkeys(names, 0.0)
-    if record.n_samples >= 4 * (_PAST + _LAGS):
-        white = {name: _whitened(record[name].values[:_LONGEST]) for name in names}
-        pairs = {pair: _chance(*(white[name] for name in pair)) for pair in combinations(names, 2)}
-        pairs |= {("current", "voltage"): 0.0} if coil else {}
-        chance = {name: min(p for pair, p in pairs.items() if name in pair) for name in names}
+    white = {name: _whitened(record[name].values[:_LONGEST]) for name in names}
+    pairs = {pair: _chance(*(white[name] for name in pair)) for pair in combinations(names, 2)}
+    pairs |= {("current", "voltage"): 0.0} if coil else {}
+    chance = {name: min(p for pair, p in pairs.items() if name in pair) for name in names}
     alone = max(names, key=lambda name: chance[name])
     passed = chance[alone] <= _CHANCE
     others = " or ".join(name for name in names if name != alone)
@@ -198,12 +199,17 @@ def _log_runs(record: Record) -> Check:
 
 
 def agreements(
-    record: Record, rig: Rig, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float]
+    record: Record,
+    rig: Rig,
+    theta: Mapping[str, float],
+    sd: Mapping[str, float],
+    alone: Mapping[str, float],
+    freed: Freed | None = None,
 ) -> dict[str, Check]:
     """Compare the facts of a record with an estimate from it, model one-axis.
 
-    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model. The weight has a
-    check of its own, `ambid.validation.physical.gravity_balance`.
+    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model; `freed`: what
+    `free_one` says of fixed ones. The weight has a check of its own, `ambid.validation.physical.gravity_balance`.
     """
     force, coil = (abs(theta[n]) > _SHOWN * sd.get(n, np.inf) and rig.parameter(n).role == "free" for n in ("k_i", "L"))
     checks = {name: c for name, c in facts(record, rig, belongs=force, coil=coil).items() if name != "weight"}
@@ -212,7 +218,9 @@ def agreements(
         i, x = record["current"].values, record["position"].values
         rise = theta["L"] * float(i[-1] - i[0]) + theta["k_i"] * float(x[-1] - x[0])
         value = means["value"] - rise * record.rate_hz / float(i.sum())
-        checks["ohm"] = ohm(record, theta["R"], alone.get("R", 0.0), value, means["sd"])
+        gain, step = (freed or {}).get("R", (0.0, np.zeros(1)))
+        shown = (theta["R"] + float(step[-1]), abs(float(step[-1])) / np.sqrt(gain)) if gain > 0.0 else None
+        checks["ohm"] = ohm(record, theta["R"], alone.get("R", 0.0), value, means["sd"], shown=shown)
     checks["sampling"] = sampling(theta, sd, record.rate_hz)
     return checks
 
@@ -241,10 +249,14 @@ def _left(y: Array, rows: Array) -> float:
     return float(rest @ rest)
 
 
-def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1, offset: float = 0.0) -> Check:
+def ohm(
+    record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of: int = 1, offset: float = 0.0,
+    shown: tuple[float, float] | None = None,
+) -> Check:  # fmt: skip
     """Compare R with the means of a record, `mean` and its sd, ohm; one `of` several records: chance lets the farthest
     of all pass as often as a single one. `offset`: of the voltage, V, estimated beside R; where it explains the
-    difference and is not larger than a stage's, both intervals have to hold that, `size`.
+    difference and is not larger than a stage's, both intervals have to hold that, `size`. Without `sd` R is the rig's,
+    and the means contradict that, unless the record shows another (`shown`, with its sd) that is as far from them.
     """
     far = (R - mean) / float(np.hypot(sd, mean_sd))
     within = 2.0 * NormalDist().cdf(_FAR) - 1.0
@@ -252,13 +264,16 @@ def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of:
     passed = abs(far) <= limit
     i0 = float(record["current"].values.mean())
     detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
-    if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS and mean > -_FURTHER * mean_sd:
+    seen, seen_sd = shown or (R, sd if sd > 0.0 else np.inf)
+    if not passed and seen_sd < _SHARP * seen and abs(mean / seen - 1.0) > _OFFSETS and mean > -_FURTHER * mean_sd:
         passed, detail = True, f"{detail}: the means are those of offsets"
     apart = not passed
     left = far - offset / i0 / float(np.hypot(sd, mean_sd)) if i0 else far
     if apart and abs(left) <= limit and abs(mean / R - 1.0) < _STAGE:
         passed, detail = True, f"{detail}: the offset of the voltage explains it, and the intervals of both hold it"
-    if not passed:
+    if not passed and sd == 0.0:
+        detail += f", as the rig fixes it: {abs(far):.2g} sd apart. Measure R, and both channels at rest, or free R"
+    elif not passed:
         detail += (
             f": {abs(far):.2g} sd apart. An offset of {(mean - R) * i0:+.2g} V or {i0 * (1.0 - mean / R):+.2g} A, or a "
             "coil that warms up, would explain it; else the model does not hold. Measure R, and both channels at rest"
@@ -266,7 +281,8 @@ def ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float, *, of:
     return Check(
         passed=passed, detail=detail,
         values={"value": mean, "sd": mean_sd, "apart_sd": far, "current_offset": i0 * (1.0 - mean / R)},
-        cause="" if passed else "ohm", size=mean - R if apart else None,
+        cause="" if passed else "ohm" if sd > 0.0 else "fixed_value", size=mean - R if apart else None,
+        alternatives=() if passed or sd > 0.0 else ("ohm",),
     )  # fmt: skip
 
 

@@ -479,19 +479,21 @@ _COARSE = 0.4  # part of the innovations' variance that steps of a converter mak
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
 
-def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool) -> dict[str, Check]:
+def fact_checks(
+    fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool, freed: Freed | None = None
+) -> dict[str, Check]:
     """Check an estimate of model one-axis against what its record, gravity and the rig's controller say without a fit.
 
-    `robust`: which standard deviations count. The balance of gravity is asked for by default where the current keeps
-    its sign, as that of one magnet that carries a weight does, and its mean is that of the voltage, so that it is no
-    offset.
+    `robust`: which standard deviations count; `freed`: as of `assumption_checks`. The balance of gravity is asked for
+    by default where the current keeps its sign, as that of one magnet that carries a weight does, and its mean is that
+    of the voltage, so that it is no offset.
     """
     theta = fit.problem.parameters(fit.vector)
     sd, alone = (
         dict(zip(spread.names, spread.standard_deviations(robust=which).tolist(), strict=True))
         for which in (robust, False)
     )
-    checks = agreements(bench, rig, theta, sd, alone)
+    checks = agreements(bench, rig, theta, sd, alone, freed)
     if robust:
         checks["resolution"] = _resolution(bench, fit)
     loop = loop_agrees(rig, theta, bench.rate_hz)
