@@ -81,6 +81,9 @@ def test_a_second_record_is_judged_and_counts_under_strict(bench, ambid, record_
     good = ambid("identify", "first.csv", "--validate", "second.csv", "--json", "found.json", "--strict")
     assert good.code == 0
     assert "on the second record (600 samples)" in good.out
+    own = ambid("identify", "first.csv", "--validate", "first.csv", "--json", "none.json")
+    assert (own.code, own.err.count("\n")) == (2, 1)
+    assert "holds samples that the estimate is fitted to" in own.err
     judged = ambid("validate", "found.json", "second.csv", "--json", "-", "--strict")
     assert judged.code == 0
     document = json.loads(judged.out)

@@ -96,6 +96,11 @@ def overlap(a: Stretch, b: Stretch) -> bool:
     return sha256 is not None and sha256 == other and max(start, begin) + 0.5 / rate < min(ends)
 
 
+def stretch_of(record: Record) -> Stretch:
+    """Return what of a file's time a record is."""
+    return record.provenance.get("sha256"), record.start_s, record.n_samples, record.rate_hz
+
+
 class Reading(TypedDict, total=False):
     """How files are read, and which part of a record is used."""
 

@@ -27,9 +27,11 @@ from ambid.job.data import (
     known_rig,
     load_bench,
     origin,
+    overlap,
     rig_entry,
     signals_of,
     sources_of,
+    stretch_of,
 )
 from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
@@ -208,6 +210,12 @@ def identify_axis(
     say: Tick = tick or (lambda *_: None)
     clock = Clock()
     bench, plant = load_bench(record, rig, **reading), rig.plant
+    second = None if validate is None else load_bench(validate, rig, **reading)
+    if second is not None and overlap(stretch_of(bench), stretch_of(second)):
+        raise EstimationError(
+            "the record for validation holds samples that the estimate is fitted to. Give another record, or omit "
+            f"{setting('validate')}"
+        )
     clock.lap("read")
     say("identify")
     delay = rig.channel(plant.inputs[0]).delay
@@ -235,12 +243,11 @@ def identify_axis(
             _, sensitivity, warnings = loop_and_peaks(estimate, rig, bench, None)
             estimate = replace(estimate, sensitivity=sensitivity, warnings=(*estimate.warnings, *warnings))
     clock.lap("checks")
-    if validate is not None:
+    if second is not None:
         from ambid.validation.second_record import validation
 
         say("validate")
-        other = signals_of(load_bench(validate, rig, **reading), plant)
-        estimate = replace(estimate, validation=validation(estimate, other))
+        estimate = replace(estimate, validation=validation(estimate, signals_of(second, plant)))
         clock.lap("validate")
     return replace(estimate, timing_s=clock.laps, used=bench)
 

@@ -15,7 +15,7 @@ from ambid.errors import EstimationError, RecordError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, Source, load_bench, origin, overlap, rig_entry
+from ambid.job.data import Clock, Reading, Source, load_bench, origin, overlap, rig_entry, stretch_of
 from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig
@@ -495,5 +495,4 @@ def _check_together(readings: Sequence[RotorRecord]) -> None:
 
 def _same(a: Record, b: Record) -> bool:
     """Whether two records share samples: of one file, or one column of noise that repeats."""
-    stretches = [(r.provenance.get("sha256"), r.start_s, r.n_samples, r.rate_hz) for r in (a, b)]
-    return overlap(*stretches) or np.array_equal(a.channels[0].values, b.channels[0].values)
+    return overlap(stretch_of(a), stretch_of(b)) or np.array_equal(a.channels[0].values, b.channels[0].values)
