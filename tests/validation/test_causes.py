@@ -20,6 +20,7 @@ from ambid.rig import default_rig, rig_of_preset
 from ambid.signals import multisine
 from ambid.simulation import LinearPlant, simulate
 from ambid.simulation.variation import Schedule, Variation
+from ambid.validation import causes as causes_module
 from ambid.validation.causes import Cause, causes, causes_check, named_bias
 from ambid.validation.physical import by_bands
 from tests.bearing.benches import SETTINGS
@@ -390,6 +391,25 @@ def test_a_weighed_value_is_blamed_where_it_can_be_what_is_wrong(far, every, nam
     assert check.size == (None if named == "sampling" else 19.0)  # which is the fixed value's
     if named == "fixed_value":
         assert "the fixed m fits better +19 (SI) from where it is" in check.detail
+
+
+def test_a_fixed_value_is_compared_with_causes_over_the_samples_in_which_those_are_looked_for(monkeypatch):
+    """Its gain in half of a record is half; a column that the half does not see is no invalid number."""
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    fit, means = fitted(columns, rate_hz)
+    freed = {"c": (300.0, np.append(np.zeros(fit.problem.n_physical), 0.1))}
+    gains = [_fixed_gain(fit, means, freed)]
+    monkeypatch.setattr(causes_module, "_LONGEST", fit.problem.n_used // 2)
+    gains.append(_fixed_gain(fit, means, freed))
+    assert gains == pytest.approx([300.0, 150.0], rel=1e-3)
+    own = np.array([[4.0, 1e-20], [1e-20, -1e-20]])  # of rounding
+    assert np.isfinite(causes_module._scales(own)).all()
+
+
+def _fixed_gain(fit, means, freed):
+    return next(
+        c.gain for c in causes(fit, means, default_rig(), thorough=False, freed=freed) if c.name == "fixed_value"
+    )
 
 
 def test_intervals_hold_the_shift_of_the_cause_that_is_named_before_a_far_value_of_larger_gain():

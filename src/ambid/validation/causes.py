@@ -139,7 +139,7 @@ def causes(
         line = found.pop()
         at, p = lines[0].k * rate_hz / course.t.size, min(line.p, lines[0].p)
         found.append(replace(line, channel=lines[0].channel, size=at, p=p))
-    found += _fixed(fit, rig, {name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed)
+    found += _fixed(look, rig, {name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed)
     if thorough:
         found += _colours(spectra, _ways(look, slice(None)), rate_hz, fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
@@ -148,11 +148,13 @@ def causes(
     ]
 
 
-def _fixed(fit: Fit, rig: Rig, freed: Freed) -> Iterator[Cause]:
-    """Yield each fixed value as a cause: what freeing it would gain, and move; and, where that is seen, each gain and
-    the rate: an error that puts the fixed value as far from the data explains them as well, and moves the others too.
+def _fixed(look: _Look, rig: Rig, freed: Freed) -> Iterator[Cause]:
+    """Yield each fixed value as a cause: what freeing it would gain, in the part of the record that is looked at, and
+    move; and, where that is seen, each gain and the rate: an error that puts the fixed value as far from the data
+    explains them as well, and moves the others too.
     """
-    problem, theta = fit.problem, fit.problem.parameters(fit.vector)
+    fit, problem, share = look.fit, look.fit.problem, len(look.e) / look.fit.problem.n_used
+    theta = problem.parameters(fit.vector)
     n, unit = problem.n_physical, np.outer(problem.magnitude, problem.magnitude)
     for name, (gain, step) in freed.items():
         if not gain > 0.0:
@@ -171,7 +173,7 @@ def _fixed(fit: Fit, rig: Rig, freed: Freed) -> Iterator[Cause]:
         for (cause, channel), (size, shift) in moves.items():
             sizes = np.array([size])
             yield Cause(
-                name=cause, channel=channel, gain=gain, p=p, size=size, shift=shift * sure, sizes=sizes, far=far
+                name=cause, channel=channel, gain=gain * share, p=p, size=size, shift=shift * sure, sizes=sizes, far=far
             )
 
 
@@ -397,6 +399,11 @@ def _sums(look: _Look, C: Array) -> _Sums:
     )  # fmt: skip
 
 
+def _scales(own: Array) -> Array:
+    """Return the sizes of columns from their products, which rounding makes negative where the stretch sees none."""
+    return column_sizes(np.sqrt(np.maximum(np.diag(own), 0.0))[None, :])
+
+
 def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> list[Cause]:
     """Test groups of signals, each together."""
     problem = look.fit.problem
@@ -404,7 +411,7 @@ def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> li
     kept = np.ones(problem.size, dtype=bool)
     kept[problem.slices["noise"]] = False
     own = sums.own[np.ix_(kept, kept)]
-    scale = column_sizes(np.sqrt(np.diag(own))[None, :])
+    scale = _scales(own)
     values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
     visible = values > _BLIND * values[-1]
     root = (vectors[:, visible] / np.sqrt(values[visible])).T / scale
@@ -436,7 +443,7 @@ def _beside(look: _Look, columns: Sequence[Column]) -> Array:
     sums = _sums(look, _through(look, columns))
     unit = np.sqrt(np.maximum(np.diag(sums.inner), 1e-300))
     taken = sums.cross / unit @ np.linalg.pinv(sums.inner / np.outer(unit, unit), rcond=_SAME, hermitian=True)
-    scale = column_sizes(np.sqrt(np.diag(sums.own))[None, :])
+    scale = _scales(sums.own)
     both = [sums.own - taken @ (sums.cross / unit).T, sums.own]
     n = look.fit.problem.n_physical
     left, plain = (np.linalg.pinv(x / np.outer(scale, scale), rcond=_BLIND, hermitian=True)[:n, :n] for x in both)
@@ -620,7 +627,7 @@ def causes_check(
         grave=grave, cause=name, size=first.size if name == first.name else None, alternatives=others,
     )  # fmt: skip
     fixed = checks["fixed_agree"]
-    if fixed.passed or fixed.values["gain"] - _PENALTY >= net:
+    if fixed.passed or max((c.gain for c in found if c.name == "fixed_value"), default=np.inf) - _PENALTY >= net:
         return {"causes": named}
     text = f"a fixed value would fit better elsewhere, by less than {first.name} explains"
     return {"causes": named, "fixed_agree": replace(fixed, passed=True, detail=text)}
