@@ -323,12 +323,13 @@ def _judged(
     checks |= physical.assumption_checks(fit, spread, freed, delay_how)
     signals = signals_of(bench, problem.model)
     named: list[Cause] = []
-    if problem.model.name == "one-axis":
+    axis, coil = (problem.model.name == name for name in ("one-axis", "coil"))
+    if axis or coil:
         from ambid.validation.causes import causes, causes_check, named_bias
 
-        in_time = check_lag(signals)
+        in_time = {"in_time": check_lag(signals)} if axis else {}
         curved, bent, own = None, False, np.sqrt(np.diag(spread.information))
-        if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
+        if axis and (rig.magnet is not None or rig.limits is not None):  # else no law of the magnet is known
             from ambid.control.curvature import magnet_checks
             from ambid.control.experiment import MOST
 
@@ -347,14 +348,14 @@ def _judged(
                 for c in causes(fit, means, rig, thorough=thorough, delay_given=given, freed=freed)
                 if not bent or c.name != "curvature"
             ]
-            judged = causes_check(named, {**before, "in_time": in_time}, own, robust=robust, record=bench)
-            checks = {**before, **judged, "in_time": in_time}
+            judged = causes_check(named, {**before, **in_time}, own, robust=robust, record=bench)
+            checks = {**before, **judged, **in_time}
             if checks["causes"].passed:
                 break
         spread = replace(spread, bias=named_bias(named, spread.bias))
     facts: Mapping[str, Check] = {}
     used, alone = None, spread.information
-    if problem.model.name == "one-axis":
+    if axis or coil:
         facts = physical.fact_checks(fit, rig, bench, spread, robust=robust, freed=freed)
         fit, spread, used = informed(fit, rig, bench, {**checks, **facts}, spread, robust=robust)
         if used is not None:

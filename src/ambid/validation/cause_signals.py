@@ -1,4 +1,5 @@
-"""Signals of the causes that score tests look for: what each, of size one, adds to a force, a voltage or a sensor."""
+"""Signals of the causes that score tests look for: what each, of size one, adds to a force, a voltage or a sensor, and
+what is said of it."""
 
 from __future__ import annotations
 
@@ -35,10 +36,23 @@ class Course:
     theta: Mapping[str, float]
     i0: float
     rate_hz: float
+    channels: tuple[str, ...]  # that the model has
 
 
-def groups_of(s: Course, mode: float, *, thorough: bool) -> Iterator[tuple[str, tuple[Column, ...]]]:
-    """Yield the causes with their signals; a size is that of the first. `mode`: its frequency, Hz."""
+Groups = Iterator[tuple[str, tuple[Column, ...]]]
+
+
+def groups_of(s: Course, mode: float, *, thorough: bool) -> Groups:
+    """Yield the causes with their signals in channels of the model; a size is that of the first. `mode`: its frequency,
+    Hz.
+    """
+    for name, columns in _groups_of(s, mode, thorough=thorough):
+        shown = (tuple(part for part in column if part[0] in s.channels and np.any(part[1])) for column in columns)
+        if kept := tuple(filter(None, shown)):
+            yield name, kept
+
+
+def _groups_of(s: Course, mode: float, *, thorough: bool) -> Groups:
     eddy = _rate(s.before, s.rate_hz)  # of the flux, where it shunts the coil; of the force alone
     yield "eddy_pole", ((("force", -s.theta["k_i"] * _rate(s.i, s.rate_hz)),), (("voltage", s.theta["L"] * eddy),))
     yield "sensor_lag", ((("position", -s.v),),)
@@ -115,3 +129,50 @@ def _oscillation(s: Course, f: float, damping: float) -> tuple[Array, Array]:
 def _between(signal: Array) -> Array:
     """The mean from each sample to the next, as a disturbance that is held acts."""
     return np.append(0.5 * (signal[1:] + signal[:-1]), signal[-1])
+
+
+SAME_AS = {
+    "sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",), "coloured_force": ("line",),
+    "coloured_voltage": ("line",), "coloured_position": ("line",), "coloured_current": ("line",),
+    "amplifier_lag": ("limiter", "current_sensor_pole"),
+    "cross_talk": ("sensor_lag", "current_lag"),
+}  # fmt: skip
+"""What the first order of a score does not distinguish."""
+TEXT = {
+    "eddy_pole": "force or flux lags behind the current by {size:.3g} s: eddy currents. Excite more slowly, or "
+    "identify with the nonlinear magnet and its eddy pole",
+    "input_delay": "the voltage acts {size:.3g} s later than said. Leave channels.voltage.delay open, or give it",
+    "sensor_lag": "the position is logged {size:.3g} s late: a filter of its sensor. Log without it, or say the delay",
+    "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
+    "cross_talk": "the {channel} holds a part of voltage or current: cross-talk, or it is logged a sample after the "
+    "voltage that answers it. Check cables, grounds, and that all channels are of one instant",
+    "r_drift": "the resistance drifts by {size:.3g} ohm from the middle of the record to its end: the coil warms up. "
+    "Record shorter, or after it is warm",
+    "dead_time": "the coil gets {size:.3g} V less than logged, against the direction of its current: dead time or the "
+    "drop of a diode. Compensate it, or log the coil's voltage",
+    "friction": "a force of {size:.3g} N acts against the motion, whatever its speed: dry friction. Free the rotor",
+    "coloured_force": "a force around {size:.4g} Hz changes in amplitude and phase: unbalance of changing speed, flow "
+    "or motion of the base. Remove its source, or excite beside it",
+    "coloured_voltage": "the voltage around {size:.4g} Hz changes in amplitude and phase. Check the amplifier's supply",
+    "coloured_position": "the position's sensor has noise around {size:.4g} Hz that changes in amplitude and phase: "
+    "light, or an aliased tone. Filter before sampling",
+    "coloured_current": "the current's sensor has noise around {size:.4g} Hz that changes in amplitude and phase: an "
+    "aliased tone of the amplifier. Filter before sampling, or lock the sampling to it",
+    "slow_position": "the position's sensor drifts. Measure its zero before and after, or record shorter",
+    "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
+    "longer, or excite above it",
+    "slow_current": "the current's sensor drifts. Measure its zero before and after, or record shorter",
+    "amplifier_lag": "the coil's voltage follows the logged one late, as through a filter: an amplifier of small "
+    "bandwidth. Log the coil's voltage, or excite more slowly",
+    "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a gain or the rate is. Check "
+    "it, or free it",
+    "sampling": "the voltage changes between samples, so that its log does not say what the coil got. Log every sample "
+    "of the controller",
+    "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",
+    "curvature": "force or flux bends over this motion or current. Excite less, or identify the nonlinear magnet",
+    "limiter": "the amplifier does not follow the logged voltage at its ends. Log the coil's voltage, or excite less",
+    "hysteresis": "force or flux follows the current with a slack: hysteresis. Excite more, or demagnetise",
+    "flexible_mode": "the position holds a further mode. Excite below it, or use model rotor",
+    "line": "a line at {size:.4g} Hz stands in the {channel}: unbalance, motion of the base, hum or an aliased tone. "
+    "Remove its source, or log what causes it",
+}

@@ -39,7 +39,7 @@ from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, bu
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
 from ambid.rig import Rig
-from ambid.validation.cause_signals import WAVES, Column, Course, groups_of
+from ambid.validation.cause_signals import SAME_AS, TEXT, WAVES, Column, Course, groups_of
 from ambid.validation.facts import between_samples
 
 _LONGEST = 100_000  # samples that are looked at, the busiest
@@ -53,7 +53,8 @@ _LINES, _SKIRT = 6, 4  # lines that are taken together, and how far each reaches
 _CLEAR = 10.0  # power, of noise one, that no other channel of a line may leave less than, nor its own more
 _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
-_NOISE = {f"{how}_{where}" for how in ("slow", "coloured") for where in ("force", "voltage", "position", "current")}
+_CHANNELS = ("force", "voltage", "position", "current")
+_NOISE = {f"{how}_{where}" for how in ("slow", "coloured") for where in _CHANNELS}
 """Noise that is not white."""
 _IN_TIME = {*_NOISE, "line", "r_drift"}
 """Causes that change in time, which no constant of the plant can imitate."""
@@ -108,7 +109,7 @@ def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
     if predictor is None or e is None:
         return None
     at = busiest(problem.u[problem.skip :], min(_LONGEST, len(e)))
-    course = _course(fit, work.w[at, :3], at, means)
+    course = _course(fit, work.w[at], at, means)
     return _Look(fit=fit, predictor=predictor, weight=weight_of(fit.covariance), e=e[at], at=at, course=course)
 
 
@@ -116,7 +117,7 @@ def causes(
     fit: Fit, means: Mapping[str, float], rig: Rig, *, thorough: bool, delay_given: bool = False,
     freed: Freed | None = None,
 ) -> list[Cause]:  # fmt: skip
-    """Return the causes that the innovations of model one-axis may have, the strongest first.
+    """Return the causes that the innovations of model one-axis or coil may have, the strongest first.
 
     `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed;
     `delay_given`: the delay of the voltage was not estimated; `freed`: what `free_one` says of each fixed value, where
@@ -317,9 +318,10 @@ def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Arra
 
 
 def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> Course:
-    problem = fit.problem
-    x, v, i = (states * problem.scales.state[:3]).T
-    theta, delay = problem.parameters(fit.vector), problem.delay_samples(fit.vector)
+    problem, model = fit.problem, fit.problem.model
+    columns = [model.states.index(n) if n in model.states else -1 for n in ("position", "velocity", "current")]
+    x, v, i = (states[:, k] * problem.scales.state[k] if k >= 0 else np.zeros(len(states)) for k in columns)
+    theta, delay = {"k_i": 0.0, **problem.parameters(fit.vector)}, problem.delay_samples(fit.vector)
     whole = int(np.floor(delay))
     first = problem.skip + at.start - whole - 2
     raw = problem.u[np.maximum(np.arange(first, first + x.size + 2), 0), 0]
@@ -329,6 +331,7 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> C
         t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
         before=(last - rest) / theta["L"],
         theta=theta, i0=means.get("current", 0.0), rate_hz=problem.rate_hz,
+        channels=(*model.disturbances, *model.outputs),
     )  # fmt: skip
 
 
@@ -467,7 +470,8 @@ def _ways(look: _Look, which: slice) -> dict[str, Complex]:
     enter = np.linalg.solve(vectors, np.hstack([predictor.E, -predictor.gain]).astype(complex))
     through = -np.einsum("oj,kj,jb->kob", predictor.C @ vectors, 1.0 / (z[:, None] - values), enter)
     through[:, :, len(model.disturbances) :] -= np.eye(len(model.outputs))
-    return {name: through[:, :, j] @ look.weight.T for j, name in enumerate((*model.disturbances, *model.outputs))}
+    names = (*model.disturbances, *model.outputs)
+    return {name: through[:, :, j] @ look.weight.T for j, name in enumerate(names) if name in _CHANNELS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -499,7 +503,9 @@ def _lines(look: _Look) -> list[_Line]:
         left = float(np.vdot(spectra[j], spectra[j]).real) - float(shares[first])
         clear = left < _CLEAR and float(shares[first] - shares[second]) > _CLEAR
         k = periods_near(e @ ways[first].conj(), j + 2)
-        lines.append(_Line(k=k, channel=first, channels=(first,) if clear else ("force", "voltage"), p=p))
+        lines.append(
+            _Line(k=k, channel=first, channels=(first,) if clear else tuple(n for n in _CHANNELS[:2] if n in ways), p=p)
+        )
         e = without(e, waves_at(k, len(e)))
     return lines
 
@@ -523,8 +529,7 @@ def _colours(spectra: Complex, ways: Mapping[str, Complex], rate_hz: float, n_ph
     """Yield for each disturbance and sensor the low pass and the resonance that explain most of the innovations."""
     n = spectra.shape[0]
     f = np.arange(2, n + 2) * rate_hz / (2 * (n + 2))
-    for source in ("force", "voltage", "position", "current"):
-        way = ways[source]
+    for source, way in ways.items():
         a = np.maximum(np.sum(np.abs(way) ** 2, axis=1), 1e-300)
         along = np.abs(np.sum(way.conj() * spectra, axis=1)) ** 2 / a
         for name, (gain, colour) in zip(("slow", "coloured"), likely_colours(source, along, a, f), strict=True):
@@ -533,53 +538,6 @@ def _colours(spectra: Complex, ways: Mapping[str, Complex], rate_hz: float, n_ph
                 name=f"{name}_{source}", channel=source, gain=gain, p=min(1.0, n * chi_squared_tail(3, gain)),
                 size=colour.frequency_hz, shift=np.zeros(n_physical), sizes=np.zeros(1 + colour.order), colour=colour,
             )  # fmt: skip
-
-
-_SAME_AS = {
-    "sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",), "coloured_force": ("line",),
-    "coloured_voltage": ("line",), "coloured_position": ("line",), "coloured_current": ("line",),
-    "amplifier_lag": ("limiter", "current_sensor_pole"),
-    "cross_talk": ("sensor_lag", "current_lag"),
-}  # fmt: skip
-"""What the first order of a score does not distinguish."""
-_TEXT = {
-    "eddy_pole": "the force lags behind the current by {size:.3g} s: eddy currents. Excite more slowly, or identify "
-    "with the nonlinear magnet and its eddy pole",
-    "input_delay": "the voltage acts {size:.3g} s later than said. Leave channels.voltage.delay open, or give it",
-    "sensor_lag": "the position is logged {size:.3g} s late: a filter of its sensor. Log without it, or say the delay",
-    "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
-    "cross_talk": "the {channel} holds a part of voltage or current: cross-talk, or it is logged a sample after the "
-    "voltage that answers it. Check cables, grounds, and that all channels are of one instant",
-    "r_drift": "the resistance drifts by {size:.3g} ohm from the middle of the record to its end: the coil warms up. "
-    "Record shorter, or after it is warm",
-    "dead_time": "the coil gets {size:.3g} V less than logged, against the direction of its current: dead time or the "
-    "drop of a diode. Compensate it, or log the coil's voltage",
-    "friction": "a force of {size:.3g} N acts against the motion, whatever its speed: dry friction. Free the rotor",
-    "coloured_force": "a force around {size:.4g} Hz changes in amplitude and phase: unbalance of changing speed, flow "
-    "or motion of the base. Remove its source, or excite beside it",
-    "coloured_voltage": "the voltage around {size:.4g} Hz changes in amplitude and phase. Check the amplifier's supply",
-    "coloured_position": "the position's sensor has noise around {size:.4g} Hz that changes in amplitude and phase: "
-    "light, or an aliased tone. Filter before sampling",
-    "coloured_current": "the current's sensor has noise around {size:.4g} Hz that changes in amplitude and phase: an "
-    "aliased tone of the amplifier. Filter before sampling, or lock the sampling to it",
-    "slow_position": "the position's sensor drifts. Measure its zero before and after, or record shorter",
-    "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
-    "longer, or excite above it",
-    "slow_current": "the current's sensor drifts. Measure its zero before and after, or record shorter",
-    "amplifier_lag": "the coil's voltage follows the logged one late, as through a filter: an amplifier of small "
-    "bandwidth. Log the coil's voltage, or excite more slowly",
-    "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a gain or the rate is. Check "
-    "it, or free it",
-    "sampling": "the voltage changes between samples, so that its log does not say what the coil got. Log every sample "
-    "of the controller",
-    "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",
-    "curvature": "force or flux bends over this motion. Excite less, or identify the nonlinear magnet",
-    "limiter": "the amplifier does not follow the logged voltage at its ends. Log the coil's voltage, or excite less",
-    "hysteresis": "the force follows the current with a slack: hysteresis. Excite more, or demagnetise",
-    "flexible_mode": "the position holds a further mode. Excite below it, or use model rotor",
-    "line": "a line at {size:.4g} Hz stands in the {channel}: unbalance, motion of the base, hum or an aliased tone. "
-    "Remove its source, or log what causes it",
-}
 
 
 def named_bias(found: Sequence[Cause], known: Array) -> Array:
@@ -605,7 +563,8 @@ def causes_check(
         return {"causes": Check(passed=True, p=sure[0].p, values={"gain": sure[0].gain}, detail=detail)}
     first = sure[0]
     alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
-    others = tuple(dict.fromkeys([*alike, *_SAME_AS.get(first.name, ())]))
+    same = [n for n in SAME_AS.get(first.name, ()) if n != "sensor_lag" or record is None or "position" in record]
+    others = tuple(dict.fromkeys([*alike, *same]))
     if not checks["estimates_agree"].passed and between_samples(record):
         others = (*others, "sampling")
     late = checks.get("in_time")
@@ -615,7 +574,7 @@ def causes_check(
     name = first.name
     if name == "fixed_value" and "sampling" in others:  # a number of the bench is wrong less often than a log is thin
         name, others = "sampling", ("fixed_value", *(c for c in others if c != "sampling"))
-    text = _TEXT[name].format(size=first.size, channel=first.channel, where=where)
+    text = TEXT[name].format(size=first.size, channel=first.channel, where=where)
     if first.name == "line" and first.sizes.size > 8:
         text += "; more beside it"
     if others:

@@ -17,6 +17,7 @@ from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.uncertainty import Uncertainty, farthest
@@ -38,6 +39,7 @@ _PAST, _LAGS = 20, 40  # samples that whiten a signal, and between which two are
 _ENOUGH, _LONGEST = 4 * (_PAST + _LAGS), 40_000  # samples that are compared, at least and at most
 _CHANCE = 1e-3  # probability above which a relation may be chance
 _SHOWN = 3.0  # standard deviations of k_i above which current and position belong together, of L current and voltage
+_STEPS = 0.1  # part of the samples in which a voltage stands that is made of steps
 _STILL = 4  # samples in which no channel changes: the log stood still
 GRAVITY = 9.81  # m/s^2
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
@@ -187,7 +189,7 @@ def _log_runs(record: Record) -> Check:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.view(np.int8), [0]])))
     runs = [(a, b - a) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b - a >= _STILL]
     moving = 1.0 - float(still.mean())
-    if not runs or moving < 0.5:  # slow signals of coarse steps stand still together
+    if not runs or moving < 0.5 or _in_steps(record, still):  # slow signals of coarse steps stand still together
         return Check(passed=True, detail="no stretch in which the log stood still")
     first, longest = runs[0][0], max(length for _, length in runs) + 1
     at = record.start_s + first / record.rate_hz
@@ -198,6 +200,11 @@ def _log_runs(record: Record) -> Check:
     )  # fmt: skip
 
 
+def _in_steps(record: Record, still: NDArray[np.bool_]) -> bool:
+    """Return whether the rotor is held and the voltage stands for samples on end also while the current moves."""
+    return "position" not in record and float(np.mean(np.diff(record["voltage"].values)[~still] == 0.0)) > _STEPS
+
+
 def agreements(
     record: Record,
     rig: Rig,
@@ -206,17 +213,21 @@ def agreements(
     alone: Mapping[str, float],
     freed: Freed | None = None,
 ) -> dict[str, Check]:
-    """Compare the facts of a record with an estimate from it, model one-axis.
+    """Compare the facts of a record with an estimate from it, model one-axis or coil.
 
     `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model; `freed`: what
     `free_one` says of fixed ones. The weight has a check of its own, `ambid.validation.physical.gravity_balance`.
     """
-    force, coil = (abs(theta[n]) > _SHOWN * sd.get(n, np.inf) and rig.parameter(n).role == "free" for n in ("k_i", "L"))
+    force, coil = (
+        n in theta and abs(theta[n]) > _SHOWN * sd.get(n, np.inf) and rig.parameter(n).role == "free"
+        for n in ("k_i", "L")
+    )  # fmt: skip
     checks = {name: c for name, c in facts(record, rig, belongs=force, coil=coil).items() if name != "weight"}
     means = checks["ohm"].values
     if means:  # less what the flux took up from the first sample to the last
-        i, x = record["current"].values, record["position"].values
-        rise = theta["L"] * float(i[-1] - i[0]) + theta["k_i"] * float(x[-1] - x[0])
+        i, rise = record["current"].values, 0.0
+        for name, role in (("L", "current"), ("k_i", "position")):
+            rise += theta[name] * float(np.subtract(*record[role].values[[-1, 0]])) if name in theta else 0.0
         value = means["value"] - rise * record.rate_hz / float(i.sum())
         gain, step = (freed or {}).get("R", (0.0, np.zeros(1)))
         shown = (theta["R"] + float(step[-1]), abs(float(step[-1])) / np.sqrt(gain)) if gain > 0.0 else None
@@ -231,14 +242,13 @@ def between_samples(record: Record) -> bool:
     It has much power in the octave below half the rate, and says little of the next change of the current, beyond what
     the past of current and position says.
     """
-    v, i, x = (
-        record[name].values[:_LONGEST] - record[name].values.mean() for name in ("voltage", "current", "position")
-    )
+    names = [name for name in ("voltage", "current", "position") if name in record]
+    v, i, *x = (record[name].values[:_LONGEST] - record[name].values.mean() for name in names)
     power = np.abs(np.fft.rfft(v * np.hanning(v.size))) ** 2
     if power[power.size // 2 :].sum() < _TOP * power.sum():
         return False
     at = np.arange(_ORDER, i.size - 1)
-    own = [s[at - k] for s in (i, x) for k in range(4)]
+    own = [s[at - k] for s in (i, *x) for k in range(4)]
     left = [_left(i[at + 1], np.column_stack(rows)) for rows in (own, [*own, *(v[at - k] for k in range(_ORDER))])]
     return left[1] > (1.0 - _SAYS) * left[0]
 

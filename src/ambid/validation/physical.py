@@ -137,7 +137,7 @@ def innovation_checks(fit: Fit, sums: Products, spread: Uncertainty, moved: Agre
             detail=f"robust standard deviations are up to {spread.inflation:.2f} times those from the information "
             f"matrix (limit {_INFLATION:g})",
         ),
-        "estimates_agree": _estimates_agree(moved),
+        "estimates_agree": _estimates_agree(moved, held="position" not in fit.problem.model.outputs),
     }
 
 
@@ -189,7 +189,7 @@ def _explain_columns(fit: Fit, sums: Products, cross: Array, inner: Array) -> tu
     return float(inside @ inside), int(np.count_nonzero(distinct))
 
 
-def _estimates_agree(moved: Agreement) -> Check:
+def _estimates_agree(moved: Agreement, *, held: bool) -> Check:
     every = " and ".join(f"{s}{'nd' if s == 2 else 'th'}" for s in moved.strides)
     if not moved.strides:
         detail = "refits to every 2nd or 4th output sample failed: the model fits one step ahead only"
@@ -199,7 +199,8 @@ def _estimates_agree(moved: Agreement) -> Check:
         far = ", ".join(f"{k} by {s:.3g}" for k, s in zip(moved.names, moved.disagreement(), strict=True))
         detail = (
             f"refits to every {every} output sample shift the parameters by up to {moved.largest:.1f} sd ({far} in "
-            "SI): the model does not fit this record. Excite more, reduce the range of motion, or extend the model"
+            "SI): the model does not fit this record. Excite more, reduce the range of "
+            f"{'the current' if held else 'motion'}, or extend the model"
         )
     return Check(
         passed=moved.passed, grave=moved.largest > _BEYOND,
@@ -482,7 +483,8 @@ _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean curren
 def fact_checks(
     fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool, freed: Freed | None = None
 ) -> dict[str, Check]:
-    """Check an estimate of model one-axis against what its record, gravity and the rig's controller say without a fit.
+    """Check an estimate of model one-axis or coil against what its record, and of the former gravity and the rig's
+    controller, say without a fit.
 
     `robust`: which standard deviations count; `freed`: as of `assumption_checks`. The balance of gravity is asked for
     by default where the current keeps its sign, as that of one magnet that carries a weight does, and its mean is that
@@ -496,6 +498,8 @@ def fact_checks(
     checks = agreements(bench, rig, theta, sd, alone, freed)
     if robust:
         checks["resolution"] = _resolution(bench, fit)
+    if "position" not in bench:
+        return checks
     loop = loop_agrees(rig, theta, bench.rate_hz)
     checks |= {} if loop is None else {"loop_agrees": loop}
     magnet, means = rig.magnet, checks["ohm"].values
@@ -504,14 +508,9 @@ def fact_checks(
     if carries_weight(magnet, bench["current"].values):
         assert magnet is not None
         checks["gravity_balance"] = gravity_balance(
-            magnet,
-            bench,
-            theta,
-            spread.names,
-            spread.covariance(robust=False),
-            scale_sd=_scale_sd(rig),
+            magnet, bench, theta, spread.names, spread.covariance(robust=False), scale_sd=_scale_sd(rig),
             offset_sd=rig.channel("current").offset_sd or 0.0,
-        )
+        )  # fmt: skip
         if not checks["gravity_balance"].passed and theta["k_x"] > _FAR * sd.get("k_x", np.inf):
             checks["sign_of_k_x"] = Check(
                 passed=False, grave=True, cause="belonging", values={"k_x": theta["k_x"]},
