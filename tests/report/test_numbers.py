@@ -1,5 +1,7 @@
 """Numbers for people: matching digits, sensible prefixes, nothing lost."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,9 @@ CASES = [
     (587.2, 1174.0, "N/m", "0.6 ± 1.2 kN/m"),
     (-1.2, 35.0, "N/A", "-1 ± 35 N/A"),
     (-0.2, 35.0, "N/A", "0 ± 35 N/A"),
-    (1e-5, 1e150, "H", "10 ± 1e+156 uH"),
+    (1e-5, 1e150, "H", "1e-14 ± 1e+141 GH"),
+    (3.9e-12, 0.09, "H", "3.9e-09 ± 90 mH"),
+    (1e-5, math.inf, "H", "10 ± inf uH"),
 ]
 
 

@@ -41,8 +41,8 @@ def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | 
     """
     lost = not math.isfinite(sd) or sd > _LOST * abs(value) > 0
     if sd == 0 or lost:  # known exactly, or not at all: digits of the value alone
-        scale, shown_unit = prefixed(value, unit)
-        spread = "" if sd == 0 else f"{sd / scale:.0e}" if math.isfinite(sd) else "inf"
+        scale, shown_unit = prefixed(max(abs(value), sd if math.isfinite(sd) else 0.0), unit)
+        spread = "" if sd == 0 else f"{sd / scale:.3g}" if math.isfinite(sd) else "inf"
         return Quantity(
             value=f"{value / scale:.6g}",
             sd=spread,
