@@ -9,7 +9,7 @@ At the commands (I - W H)⁻¹ is limited beside.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +27,7 @@ from ambid.control.zones import ZONES
 from ambid.errors import EstimationError, ModelError, RigError
 from ambid.estimation.progress import Tick
 from ambid.physics.law import StateLaw
-from ambid.physics.loop import Loop, Noise
+from ambid.physics.loop import Limits, Loop, Noise
 from ambid.rig import Rig
 from ambid.simulation.plant import signals_fed_back
 
@@ -40,7 +40,6 @@ _ROUNDS = 4  # of that
 _FIRST, _FINEST = 4.0, 1.15  # factors on the knobs between tries
 
 Knobs = tuple[float, ...]
-Make = Callable[[Knobs], StateLaw]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,26 +109,47 @@ class Family:
 
 @dataclass(kw_only=True, eq=False)
 class _Tries:
-    """Laws by their knobs, each made and looked at once."""
+    """Laws for the first of some plants by their knobs (effort, disturbances, integral's time), each made and looked at
+    once.
+    """
 
-    make: Make
     family: Family
-    tick: Callable[[], None]
+    rig: Rig
+    limits: Limits
+    most: int  # tries that are expected
+    tick: Tick
 
     def __post_init__(self) -> None:
-        self._known: dict[tuple[float, ...], tuple[StateLaw | None, Mapping[str, float]]] = {}
+        self._known: dict[Knobs, tuple[StateLaw | None, Mapping[str, float]]] = {}
 
     def at(self, knobs: Knobs) -> tuple[StateLaw | None, Mapping[str, float]]:
         """Return the law and its figures; none where the knobs give no law."""
         key = tuple(round(math.log(x), 6) for x in knobs)
         if key not in self._known:
-            self.tick()
+            self.tick("tune", min((len(self._known) + 1) / self.most, 0.99))
             try:
-                law = self.make(knobs)
+                law = self._law(knobs)
                 self._known[key] = law, self.family.figures(law)
             except EstimationError:  # no law with these knobs
                 self._known[key] = None, {"pole": math.inf}
         return self._known[key]
+
+    def _law(self, knobs: Knobs) -> StateLaw:
+        """Return a law that fits in the words of the rig's controller; EstimationError where there is none."""
+        effort, disturbance, integral = knobs
+        weights, noise = Weights.of(self.limits, integral), self.rig.noise or Noise()
+        law = lqg(self.family.plants[0], weights, noise, effort=effort, disturbance=disturbance).law
+        if self.rig.daq is None:
+            return law
+        each = [weights.position, weights.current if math.isfinite(weights.current) else 1.0]
+        axes = law.D.shape[0]
+        sizes = np.tile(each[: law.D.shape[1] // axes], axes)
+        for order in range(min(law.order, LAW_STATES), 1, -1):  # modes that nearly cancel do not fit in its words
+            with suppress(ModelError, RigError):
+                less = reduced(law, order, sizes, weights.command)[0]
+                held_by(self.rig, Loop(law=less))
+                return less
+        raise EstimationError("no LQG law of these weights fits in the words of the rig's controller")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,28 +204,30 @@ def _ways(n: int) -> list[tuple[int, ...]]:
     return [*pairs, *(tuple(side * (j == k) for j in range(n)) for k in range(2, n) for side in (-1, 1))]
 
 
-def design_by_knobs(
-    make: Make, grid: Sequence[Knobs], plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick
-) -> Loop:
-    """Return the loop whose law does best on the worst plant; EstimationError where none meets the limits."""
+def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+    """Return the loop whose law, for the first of some plants, does best on the worst of them; EstimationError where
+    none meets the limits.
+    """
+    settling = goals.limits.get("settling", goals.reference["settling"])
+    if rig.limits is None:
+        raise EstimationError("the rig gives no [limits]; LQG weighs by them. Give limits.position and limits.voltage")
+    grid: list[Knobs] = [
+        (_FIRST**a, _FIRST**b, settling / (c * _SETTLED))
+        for a in range(-2, 2)
+        for b in range(-2, 3)
+        for c in (1.0, 1.5)
+    ]
     noise, score = noise_of(rig.noise, {})[:2], Score.of(goals)
-    done, most = 0, 6 * len(grid)
-
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        tick("tune", min(done / most, 0.99))
-
-    tries = _Tries(make=make, family=Family(plants=tuple(plants), noise=noise), tick=advance)
+    family = Family(plants=tuple(plants), noise=noise)
+    tries = _Tries(family=family, rig=rig, limits=rig.limits, most=6 * len(grid), tick=tick)
     for _ in range(_ROUNDS):
         best = _search(tries, score, grid)
         law, figures = tries.at(best)
         if law is None or not score.met(figures):
             break
         loop = Loop(law=law, delay=0.0 if rig.loop is None else rig.loop.delay)
-        over = worst_of([examine(p, loop, noise).figures for p in plants]).settling / goals.limits.get(
-            "settling", math.inf
-        )
+        settled = worst_of([examine(p, loop, noise).figures for p in plants]).settling
+        over = settled / goals.limits.get("settling", math.inf)
         if over <= 1.0:
             return loop
         score.limits["settling"] = figures["settling"] * math.exp(-_SLACK) / over
@@ -230,34 +252,3 @@ def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs]) -> str:
         f"no LQG law meets the limits ({limits}) on all plants; with the others kept, {said(limit, least)} is the "
         f"least. Give {raised(limit, least)}, or raise another"
     )
-
-
-def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-    """Return the law for the first of some plants, its knobs (effort, disturbances, integral's time) set by all."""
-    limits, settling = rig.limits, goals.limits.get("settling", goals.reference["settling"])
-    if limits is None:
-        raise EstimationError("the rig gives no [limits]; LQG weighs by them. Give limits.position and limits.voltage")
-    noise = rig.noise or Noise()
-    grid = [
-        (_FIRST**a, _FIRST**b, settling / (c * _SETTLED))
-        for a in range(-2, 2)
-        for b in range(-2, 3)
-        for c in (1.0, 1.5)
-    ]
-
-    def make(knobs: Knobs) -> StateLaw:
-        weights = Weights.of(limits, knobs[2])
-        law = lqg(plants[0], weights, noise, effort=knobs[0], disturbance=knobs[1]).law
-        if rig.daq is None:
-            return law
-        each = [weights.position, weights.current if math.isfinite(weights.current) else 1.0]
-        axes = law.D.shape[0]
-        sizes = np.tile(each[: law.D.shape[1] // axes], axes)
-        for order in range(min(law.order, LAW_STATES), 1, -1):  # modes that nearly cancel do not fit in its words
-            with suppress(ModelError, RigError):
-                less = reduced(law, order, sizes, weights.command)[0]
-                held_by(rig, Loop(law=less))
-                return less
-        raise EstimationError("no LQG law of these weights fits in the words of the rig's controller")
-
-    return design_by_knobs(make, grid, plants, rig, goals, tick)

@@ -342,56 +342,7 @@ class Nlms(_Gradient):
         super().__init__(names, start, prior, noise_sd, far, KIND=self._at.NLMS, STEP=step, SMALL=small)
 
 
-class _OnSignals(Copied):
-    """A recursion on regressors that is fed with signals; `columns`: channel (0: output, then inputs, -1: constant 1),
-    lag and sign of each column of the regressor.
-    """
-
-    def __init__(self, columns: Sequence[tuple[int, int, int]], n_inputs: int, estimator: RecursiveEstimator) -> None:
-        self._table = np.array(columns, dtype=np.int64).reshape(-1, 3)
-        self._past = np.full((max(1, int(self._table[:, 1].max())), 1 + n_inputs), np.nan)
-        self._n_inputs, self._estimator = n_inputs, estimator
-
-    def _signals(self, u: ArrayLike, y: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-        """Return channels [y, u], the outputs (n_samples,) and the shape of `y`."""
-        if isinstance(y, float) and isinstance(u, float) and self._n_inputs == 1:  # quickly
-            return np.array([[y, u]]), np.array([y]), ()
-        inputs, outputs, shape = as_blocks("ARX", u, y, self._n_inputs)
-        return np.hstack([outputs, inputs]), outputs[:, 0], shape
-
-    def _rows(self, x: Array) -> Array:
-        """Return the columns (n_samples, n_columns) for the next samples x (n_samples, n_channels)."""
-        rows = np.empty((x.shape[0], self._table.shape[0]))
-        kernels("regression").tapped(self._past, self._table, x, rows)
-        return rows
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The coefficients."""
-        return self._estimator.names
-
-    @property
-    def estimate(self) -> Array:
-        """A copy, shape (p,)."""
-        return self._estimator.estimate
-
-    @property
-    def covariance(self) -> Array:
-        """A copy, shape (p, p)."""
-        return self._estimator.covariance
-
-    @property
-    def n_used(self) -> int:
-        """Samples that were used."""
-        return self._estimator.n_used
-
-    @property
-    def n_rejected(self) -> int:
-        """Samples that were not: not finite, or in need of past signals that are unknown."""
-        return self._estimator.n_rejected
-
-
-class RecursiveArx(_OnSignals):
+class RecursiveArx(Copied):
     """A recursion on regressors, fed with signals: a `RecursiveEstimator` of A(q) y = B(q) u + constant + v, φ(t) =
     [-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7).
 
@@ -434,7 +385,34 @@ class RecursiveArx(_OnSignals):
         orders = [nb] if isinstance(nb, int) else list(nb)
         delays = [nk] * len(orders) if isinstance(nk, int) else list(nk)
         columns, names = columns_of(na, orders, delays, offset=offset)
-        super().__init__(columns, len(orders), estimator(tuple(names)))
+        self._table = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        self._past = np.full((max(1, int(self._table[:, 1].max())), 1 + len(orders)), np.nan)
+        self._n_inputs, self._estimator = len(orders), estimator(tuple(names))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coefficients."""
+        return self._estimator.names
+
+    @property
+    def estimate(self) -> Array:
+        """A copy, shape (p,)."""
+        return self._estimator.estimate
+
+    @property
+    def covariance(self) -> Array:
+        """A copy, shape (p, p)."""
+        return self._estimator.covariance
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were used."""
+        return self._estimator.n_used
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples that were not: not finite, or in need of past signals that are unknown."""
+        return self._estimator.n_rejected
 
     def update(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -455,14 +433,20 @@ class RecursiveArx(_OnSignals):
         EstimationError
             If the shapes do not fit.
         """
-        x, outputs, shape = self._signals(u, y)
-        return self._estimator.update(self._rows(x), outputs).reshape(shape)
+        if isinstance(y, float) and isinstance(u, float) and self._n_inputs == 1:  # quickly
+            x, shape = np.array([[y, u]]), ()
+        else:
+            inputs, outputs, shape = as_blocks("ARX", u, y, self._n_inputs)
+            x = np.hstack([outputs, inputs])
+        rows = np.empty((x.shape[0], self._table.shape[0]))
+        kernels("regression").tapped(self._past, self._table, x, rows)
+        return self._estimator.update(rows, x[:, 0]).reshape(shape)
 
 
 def columns_of(
     na: int, nb: Sequence[int], nk: Sequence[int], *, offset: bool
 ) -> tuple[list[tuple[int, int, int]], list[str]]:
-    """Return columns (channel, lag, sign) and their names; channel 0 is the output, then come the inputs."""
+    """Return columns (channel, lag, sign) and their names; channel 0 is the output, then come the inputs, -1 is 1."""
     if na < 0 or len(nb) != len(nk) or any(n < 0 for n in (*nb, *nk)) or na + sum(nb) == 0:
         raise EstimationError(
             f"na={na}, nb={list(nb)}, nk={list(nk)}: orders must be at least 0, and not all 0. Correct them"
