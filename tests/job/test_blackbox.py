@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from ambid.job import fit
+import ambid
+from ambid.errors import EstimationError
+from ambid.job import fit, physics
+from ambid.rig import default_rig
 
 
 def test_a_choice_of_orders_says_what_share_is_over(tmp_path) -> None:
@@ -28,3 +32,18 @@ def test_a_choice_of_orders_says_what_share_is_over(tmp_path) -> None:
     told.clear()
     fit(tmp_path / "r.csv", input="u", output="y", structure="arx", orders={"na": 2, "nb": 1}, tick=listen)
     assert told == [("fit", None), ("check", None)]
+
+
+def test_a_fit_of_channels_of_two_runs_is_disowned_by_the_record() -> None:
+    """And where it leads to no plant, the refusal begins with what the record says."""
+    one, other = (ambid.simulate("levitated-ball", duration=2.0, seed=seed) for seed in (1, 2))
+    columns = {name: one[name].values for name in ("voltage", "current", "position")}
+    sound, mixed = (
+        fit(c, "n4sid", "n=3", rate_hz=one.rate_hz, units={"voltage": "V", "current": "A", "position": "m"})
+        for c in (columns, {**columns, "position": other["position"].values[::-1].copy()})
+    )
+    assert "belonging" not in sound.checks
+    assert mixed.verdict.word == "unusable"
+    assert mixed.verdict.reasons[0].cause == "belonging"
+    with pytest.raises(EstimationError, match=r"^nothing relates the position to .* Further: "):
+        physics(mixed, default_rig())

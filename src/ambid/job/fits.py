@@ -289,7 +289,11 @@ def physics(found: BlackBoxFit, rig: RigSource) -> PhysicalFit:
             f"and name columns by {setting('input')} and {setting('output')}"
         )
     plant = model(bench.model)
-    return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
+    try:
+        return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
+    except EstimationError as refusal:  # for a reason that the record may give
+        reasons = [r.text for r in found.reasons if r.cause]
+        raise EstimationError(". Further: ".join([*reasons, str(refusal)])) from None
 
 
 @of_job("compare")

@@ -25,7 +25,10 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import criteria, p_text, skipped
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel, nonlinear_structure
+from ambid.record import Channel, Record
+from ambid.rig.roles import ROLES
 from ambid.settings.caller import setting
+from ambid.validation.facts import facts
 from ambid.validation.residuals import (
     LEAST,
     MOST,
@@ -52,6 +55,7 @@ _SAME = 1e-9  # one-step prediction against free run, relative to the output's s
 _REACH = 10.0  # spans of what was measured that a free run may reach
 _SHARE = 0.01  # of a record outside the training data, from which it is worth a warning
 _GROWN = 1.5  # times the errors of identification that a second record may show, as for physical estimates
+_OF_ANY_MODEL = ("belonging", "position_size", "log_runs")  # facts of a record
 _OUTSIDE = 0.1  # part of a second record that may lie outside the training data, as for the nonlinear magnet
 
 
@@ -128,6 +132,8 @@ def _conclude(
     more: list[str],
 ) -> AnyFit:
     one, free = (_sizes(records, runs, free=free) for free in (False, True))
+    for data in records:
+        checks |= _against(data)
     judged_fit = replace(
         fit,
         fit=output_fits(fit.outputs, one, free, fit.noise_covariance),
@@ -139,6 +145,14 @@ def _conclude(
     if judged is None:
         return judged_fit
     return replace(judged_fit, checks={**checks, "second_record": second_check(judged_fit, judged)})
+
+
+def _against(data: IOData) -> dict[str, Check]:
+    """Return the facts of a record, of channels that are named by role, that stand against any model of it."""
+    columns = zip((*data.inputs, *data.outputs), np.hstack([data.u, data.y]).T, strict=True)
+    channels = tuple(Channel(name=n, unit=ROLES[n], values=x) for n, x in columns if ROLES.get(n) == data.units[n])
+    known = facts(Record(rate_hz=1.0 / data.dt, channels=channels, start_s=data.start_s)) if channels else {}
+    return {n: c for n, c in known.items() if n in _OF_ANY_MODEL and not c.passed}
 
 
 def validation(fit: BlackBoxFit | NonlinearFit, second: IOData) -> dict[str, dict[str, Any]]:
