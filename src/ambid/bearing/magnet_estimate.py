@@ -107,7 +107,7 @@ def estimate_bearing(
             search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
         )  # fmt: skip
         if white is not None and "drift" in extend:
-            fit = _drifting(fit, short, white, again)
+            fit = _with_drift(fit, laws, parameters, short, linear, white, again)
     if fit.status == "failed":
         raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
     return fit
@@ -214,6 +214,34 @@ def _extended(
         return fit
     richer = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
     return richer if fit.criterion - richer.criterion > price else fit
+
+
+def _with_drift(
+    fit: BearingFit, laws: Sequence[MagnetLaw], parameters: Mapping[str, Parameter], short: Sequence[BearingRecord],
+    linear: LinearStart, white: Callable[[BearingFit], bool], tick: Tick | None,
+) -> BearingFit:  # fmt: skip
+    """Return a fit with a drift where one is taken in, unless a magnet with the other gap law explains the records
+    better by the price of a number: the drift stood for a wrong law then. That law is taken where it is one of `laws`;
+    where it is not, the fit says by how much it is `beaten`.
+    """
+    more, law = _drifting(fit, short, white, tick), fit.problem.law
+    other = replace(law, gap="hyperbolic" if law.gap == "exponential" else "exponential")
+    open_to_it = other.gap in {x.gap for x in laws}
+    if law.pair or fit.status == "failed" or (more is fit and open_to_it):
+        return more
+    fresh, price = start_numbers(other, parameters, short, linear), float(np.log(fit.problem.n_used))
+    rivals = list[BearingFit]()
+    for base in (fit, more)[: 1 + (more is not fit)]:
+        known = {n.name: n for n in (*fresh, *base.problem.numbers)}
+        problem = replace(base.problem, law=other, numbers=tuple(known[name] for name in (*other.names, *BODY)))
+        rivals.append(search(problem, _carried(base, problem), iterations=_LONG, tick=tick))
+    bic, rival = min(((r.criterion + r.problem.size * price, r) for r in rivals), key=lambda x: x[0])
+    gain = more.criterion + more.problem.size * price - bic
+    if gain <= price:
+        return more
+    if open_to_it:
+        return rival if not rival.problem.drift or white(rival) else fit
+    return replace(fit, beaten=gain)
 
 
 def _drifting(

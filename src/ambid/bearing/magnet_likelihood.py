@@ -50,6 +50,7 @@ class BearingFit(PhysicalFit):
 
     problem: BearingProblem
     at: Linear | None  # the criterion about `vector`; None where the search failed
+    beaten: float = 0.0  # by how much a law that was not asked for lowers the criterion with its price
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

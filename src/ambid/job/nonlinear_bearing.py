@@ -281,7 +281,7 @@ def judge_bearing(
     spread = replace(spread, disagreement=np.vstack([*moves, contradicted]))
     wide = robust or len(contradicted) > 0
     parameters = _parameters(fit, spread, robust=wide)
-    checks = {**told, **residuals, "identifiable": _shown(parameters)} | _gravity(fit)
+    checks = {**told, **residuals, "identifiable": _shown(parameters)} | _gravity(fit) | _law(fit)
     noise = {
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
         for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
@@ -397,6 +397,16 @@ def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
         "give a prior, or record with more motion"
     )  # fmt: skip
     return Check(passed=not hidden, detail=detail)
+
+
+def _law(fit: BearingFit) -> dict[str, Check]:
+    """Say where the gap law of the rig is contradicted by the other one."""
+    gap, other = sorted(("hyperbolic", "exponential"), key=lambda x: x != fit.problem.law.gap)
+    detail = (
+        f"the {other} law explains the records better than the {gap} one of the rig (its criterion is {fit.beaten:.0f} "
+        "lower): residuals may be white, and numbers wrong all the same. Omit magnet.gap"
+    )
+    return {"law": Check(passed=False, detail=detail, values={"criterion": fit.beaten})} if fit.beaten else {}
 
 
 def _gravity(fit: BearingFit) -> dict[str, Check]:
