@@ -60,7 +60,7 @@ def _regressions() -> Iterator[Job]:
 
     yield job(
         "RLS, 4 coefficients, forgetting",
-        lambda: RecursiveLeastSquares(4, prior=1 / EPS, forgetting="exponential", factor=FORGETTING, limit=1e9),
+        lambda: RecursiveLeastSquares(4, prior=1 / EPS, factor=FORGETTING, limit=1e9),
         "padasip", "padasip", "rls", mu=FORGETTING, eps=EPS,
     )  # fmt: skip
     yield job(

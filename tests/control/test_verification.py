@@ -158,7 +158,7 @@ def test_fast_eddy_currents_are_a_delay_and_cost_no_time():
 def test_what_a_rotor_does_on_its_stop_is_no_contact_and_coming_back_is():
     plant, rig, loop = given("unstable-bearing")
     bench = workbench(plant, rig, loop)
-    trying = _Trying(bench=bench, trials=Trials(), seed=0)
+    trying = _Trying(bench=bench, trials=Trials())
     stop, fall = bench.stops[0], np.exp(-np.arange(4000) / 200.0)
     fall[:30] = 1.0
     fall[10:12] = 0.998  # it chatters

@@ -119,13 +119,13 @@ class Verification:
 
 def verify(
     plant: Plant, rig: Rig, loop: Loop, *, name: str = "the estimate", trials: Trials | None = None,
-    nonlinear: bool = True, seed: int = 0,
+    nonlinear: bool = True,
 ) -> Verification:  # fmt: skip
     """Try a loop on a plant, the nonlinear one that linearises to it unless told otherwise, its delay in place of the
     loop's; `rig`: limits, noise, resolutions, point of rest and magnet.
     """
     bench, todo = workbench(plant, rig, loop, nonlinear=nonlinear), trials or Trials()
-    trying = _Trying(bench=bench, trials=todo, seed=seed)
+    trying = _Trying(bench=bench, trials=todo)
     cases = [*trying.lift_off(), *trying.force_steps(), *trying.impacts(), *trying.unbalance()]
     cases += [*trying.noise(), *trying.limit_cycle]
     return Verification(
@@ -136,27 +136,21 @@ def verify(
     )
 
 
-def verify_all(
-    plants: Mapping[str, Plant], rig: Rig, loop: Loop, *, trials: Trials | None = None, nonlinear: bool = True,
-    seed: int = 0, tick: Tick = silent,
-) -> tuple[Verification, ...]:  # fmt: skip
+def verify_all(plants: Mapping[str, Plant], rig: Rig, loop: Loop, *, tick: Tick = silent) -> tuple[Verification, ...]:
     """Try a loop on plants by name, the estimate first: all are pushed as it is, and only its traces are kept."""
-    todo, results = trials or Trials(), list[Verification]()
+    todo, results = Trials(), list[Verification]()
     for k, (name, plant) in enumerate(plants.items()):
         tick("nonlinear simulation", k / len(plants))
         if not k:
-            first = _Trying(bench=workbench(plant, rig, loop, nonlinear=nonlinear), trials=todo, seed=seed)
+            first = _Trying(bench=workbench(plant, rig, loop), trials=todo)
             todo = replace(
                 todo, force=tuple(first.sizes(todo.force, _STEP)),
                 impulse=tuple(first.sizes(todo.impulse, _IMPACT_S)), speed=first.speed,
                 unbalance=first.moment if "m" in plant.theta else None,
             )  # fmt: skip
-        verification = verify(plant, rig, loop, name=name, trials=todo, nonlinear=nonlinear, seed=seed)
-        results.append(
-            verification
-            if not k
-            else replace(verification, cases=tuple(replace(case, trace=None) for case in verification.cases))
-        )
+        found = verify(plant, rig, loop, name=name, trials=todo)
+        plain = found.cases if not k else tuple(replace(case, trace=None) for case in found.cases)
+        results.append(replace(found, cases=plain))
     return tuple(results)
 
 
@@ -195,7 +189,6 @@ class _Trying:
 
     bench: Workbench
     trials: Trials
-    seed: int
 
     # --- what the cases share -----------------------------------------------------------------------------------------
 
@@ -485,7 +478,7 @@ class _Trying:
         plant_model = self.bench.plant.model
         n = min(max(round(0.5 * self.rate_hz), 2000), _LONGEST[self.many])
         try:
-            answer = self.bench.respond(n, seed=self.seed)
+            answer = self.bench.respond(n, seed=0)
         except ModelError as problem:
             return [self.broken("noise", "noise", problem)]
         rms = tuple(float(np.std(x[n // 5 :], axis=0).max(initial=0.0)) for x in answer[:3])

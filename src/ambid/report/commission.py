@@ -275,17 +275,13 @@ def measured_picture(loops: Mapping[str, Margins]) -> Picture:
 _NONE: Array = np.empty(0)
 
 
-def _trace(
-    axes: Axes, role: str, values: Array, rate_hz: float, ends: Sequence[float], shaded_s: float | None = None
-) -> None:
+def _trace(axes: Axes, role: str, values: Array, rate_hz: float, ends: Sequence[float]) -> None:
     """Draw a quantity over time, within its trips."""
     scale, unit = prefixed(float(np.max(np.abs(values), initial=0.0)), UNITS[role])
     curve(axes, np.arange(values.size) / rate_hz, values / scale, MEASURED, None)
     for end in ends:
         if math.isfinite(end):
             axes.axhline(end / scale, color=BOUND, linestyle="--", linewidth=1.0)
-    if shaded_s is not None:
-        axes.axvspan(0.0, shaded_s, color="#eeeeee", zorder=0)
     axes.set_ylabel(f"{role} [{unit}]")
     axes.set_xlabel("time [s]")
     axes.margins(x=0.0)
@@ -370,14 +366,13 @@ def step_section(step: Step, place: str) -> Section:
 
 
 def next_text(
-    passed: bool, step: str, number: int, total: int, folder: str, *, command: str = "", remedy: str = "",
-    width: int = WIDTH,
-) -> str:  # fmt: skip
+    passed: bool, step: str, number: int, total: int, folder: str, *, command: str = "", remedy: str = ""
+) -> str:
     """Say where a commissioning ended, and what to do next.
 
     `passed`: whether it came to its end; `step`: the last one; `number`, `total`: which of how many it is; `folder`:
-    where the files are; `command`: what is said to be run next, on a line of its own; `remedy`: the step's;
-    `width`: columns. Returns lines without the last line's end.
+    where the files are; `command`: what is said to be run next, on a line of its own; `remedy`: the step's. Returns
+    lines without the last line's end.
     """
     if passed:
         said = [
@@ -390,7 +385,7 @@ def next_text(
             f" {folder}/report.html shows it.",
             f"Next: {remedy or _next(step, folder)}. Then commission again, into another folder.",
         ]
-    lines = [line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False)]
+    lines = [line for text in said for line in textwrap.wrap(text, WIDTH, break_on_hyphens=False)]
     return "\n".join([*lines, *([f"  {command}"] if command else [])])
 
 

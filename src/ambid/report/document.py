@@ -290,11 +290,11 @@ def plain_parts(parts: Sequence[Part]) -> list[dict[str, Any]]:
     return plain
 
 
-def ending(result: Any, *, checks: bool = True, warnings: bool = True) -> list[Section]:
+def ending(result: Any) -> list[Section]:
     """Return what a result ends with: its checks, the warnings that say more than they do, and how long it took."""
     return [
-        *([Section(title="Checks", parts=[Checks(checks=result.checks, above=True)])] if checks else []),
-        *([Section(parts=[Warnings(warnings=other_warnings(result.checks, result.warnings))])] if warnings else []),
+        Section(title="Checks", parts=[Checks(checks=result.checks, above=True)]),
+        Section(parts=[Warnings(warnings=other_warnings(result.checks, result.warnings))]),
         timing_section(result.timing_s),
     ]
 

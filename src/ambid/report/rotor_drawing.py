@@ -34,9 +34,7 @@ _EXPECTED = 3  # modes of a drawing that are looked at beyond those identified
 _PLANAR = 0.02  # of a circular orbit, under which a whirl has no direction
 
 
-def shapes_block(
-    planes: Mapping[str, float], modes: Sequence[Mode] = (), *, shaft: Shaft | None = None, title: str = ""
-) -> Block:
+def shapes_block(planes: Mapping[str, float], modes: Sequence[Mode] = (), *, shaft: Shaft | None = None) -> Block:
     """Draw a rotor from the side, and below it each mode: identified at the planes, with a drawing along the shaft.
 
     `planes`: of bearings and sensors by the names of the model (``A.z``, ``A.z_sensor``), m from the datum; the shapes
@@ -53,7 +51,7 @@ def shapes_block(
     ends = _ends(planes, shaft)
     rows = [panel(_side, planes, shaft, drawn, ends, height=1.7)]
     rows += [panel(_shape, mode, k, planes, drawn, ends, modes, height=1.35) for mode, k in pairs]
-    return Block(columns=[rows], title=title)
+    return Block(columns=[rows])
 
 
 def expected_rotor(modes: Sequence[Mode], shaft: Shaft, planes: Sequence[float] = ()) -> FreeRotor:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_AROUND = 1.6  # how far the model is drawn beyond the excited band
+_AROUND, _GRID = 1.6, 500  # how far the model is drawn beyond the excited band, at how many frequencies
 _WIDEST = 1e9  # rad/s, from which the spread of a pole is not drawn
 _RAYLEIGH_95 = float(np.sqrt(-np.log(0.05)))  # 95 % of |e| over its standard deviation √E|e|²
 _SHARE = 0.5  # of the largest input at a line, from which a line without a reference counts as one of this axis
@@ -92,7 +92,7 @@ def rotor_overview(evidence: RotorEvidence, width: float = WIDE) -> Figure:
 # --- response -------------------------------------------------------------------------------------------------------
 
 
-def response_of(estimate: RotorEstimate, run: RotorReplay | None = None, *, n_frequencies: int = 500) -> ModelResponse:
+def response_of(estimate: RotorEstimate, run: RotorReplay | None = None) -> ModelResponse:
     """Return the response of every pair with its spread, sampled, with hold and delay, as records show it.
 
     `run`: at the speed and around the band of this record; default: at that of the estimate, up to half the rate.
@@ -102,7 +102,7 @@ def response_of(estimate: RotorEstimate, run: RotorReplay | None = None, *, n_fr
     model = at_speed(estimate, estimate.speed if run is None else run.experiment.speed)
     space, at = model.matrices(estimate.numbers), point_of(estimate)
     poles = np.linalg.eigvals(space.A).astype(np.complex128)
-    f = frequency_grid(poles, lines[0] / _AROUND, min(_AROUND * lines[-1], 0.499 * rate), n_frequencies)
+    f = frequency_grid(poles, lines[0] / _AROUND, min(_AROUND * lines[-1], 0.499 * rate), _GRID)
     sampled = Sampled(space=space, omega=2 * np.pi * f, rate_hz=rate, delays=at.delays, held=model.held)
     n_u = len(model.inputs)
     unit = np.eye(n_u, dtype=complex)

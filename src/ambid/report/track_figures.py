@@ -114,9 +114,7 @@ class TrackHistory:
         return value, sd, stale > 0
 
 
-def track_figure(
-    track: Track | TrackHistory, *, truth: Truth | None = None, title: str | None = None, width: float = WIDE
-) -> Figure:
+def track_figure(track: Track | TrackHistory, *, truth: Truth | None = None, width: float = WIDE) -> Figure:
     """Draw a track.
 
     Parameters
@@ -125,8 +123,6 @@ def track_figure(
         With one line at least.
     truth : Mapping of parameter to (t, values), optional
         Each of shape (n,), s of record and SI.
-    title : str, optional
-        Default: the record's name, the model and the method.
     width : float, optional
         Inches.
 
@@ -160,7 +156,7 @@ def track_figure(
     panels = [panel(parameter, name, height=1.55) for name in names]
     panels += [Panel(draw=error, height=1.35), Panel(draw=state, height=0.5)]
     page = stacked(
-        title or f"{head.record.get('file') or 'record'}: model {head.model}, {head.method}",
+        f"{head.record.get('file') or 'record'}: model {head.model}, {head.method}",
         [Block(columns=[panels], legend=_legend(history, bool(set(truth) & set(names)), marks))], width,
     )  # fmt: skip
     page.align_ylabels(page.axes[:-1])
