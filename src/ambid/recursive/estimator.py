@@ -112,13 +112,13 @@ def as_blocks(
     return _rows(u, n, n_inputs), _rows(y, n, n_outputs), y.shape
 
 
-def as_block(given: Array, channels: int, name: str) -> Array:
+def as_block(given: Array, channels: int) -> Array:
     """Return one sample or a block of `channels` signals as a block (n_samples, channels)."""
     n = given.shape[0] if given.ndim == 2 or (given.ndim == 1 and channels == 1) else 1
     if not _fits(given, n, channels):
         raise EstimationError(
-            f"{name}: input of shape {given.shape} for {channels} channels; it must be ({channels},) for a sample or "
-            f"(n_samples, {channels}) for a block. Reshape it"
+            f"Kalman filter: input of shape {given.shape} for {channels} channels; it must be ({channels},) for a "
+            f"sample or (n_samples, {channels}) for a block. Reshape it"
         )
     return _rows(given, n, channels)
 
@@ -152,15 +152,15 @@ def numbers(name: str, value: ArrayLike, p: int) -> Array:
     return np.full(p, found) if found.ndim == 0 else found.copy()
 
 
-def prior_of(name: str, value: ArrayLike, p: int) -> Array:
-    """Return `value`, a variance, p variances or a matrix, as a positive definite matrix (p, p)."""
+def prior_of(value: ArrayLike, p: int) -> Array:
+    """Return `value`, a prior variance, p variances or a matrix, as a positive definite matrix (p, p)."""
     found = np.asarray(value, dtype=np.float64)
-    matrix = found if found.shape == (p, p) else np.diag(numbers(name, found, p))
+    matrix = found if found.shape == (p, p) else np.diag(numbers("prior", found, p))
     sd = np.sqrt(np.diag(matrix)) if (np.diag(matrix) > 0).all() and np.isfinite(matrix).all() else np.zeros(p)
     if not sd.all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
-        raise EstimationError(f"{name} must be symmetric with positive variances")
+        raise EstimationError("prior must be symmetric with positive variances")
     if np.linalg.eigvalsh(matrix / np.outer(sd, sd))[0] < 1e-12:
-        raise EstimationError(f"{name} must be positive definite; a combination of its coefficients has no variance")
+        raise EstimationError("prior must be positive definite; a combination of its coefficients has no variance")
     return matrix
 
 

@@ -186,7 +186,7 @@ class KalmanFilter(Copied):
             self._run(y, self._none, out)
             return out[0].copy()
         raw = np.asarray(measurement, dtype=np.float64)
-        y, u = as_block(raw, self._m, "Kalman filter"), self._none
+        y, u = as_block(raw, self._m), self._none
         n = y.shape[0]
         if self._n_u or inputs is not None:
             given = np.asarray([] if inputs is None else inputs, dtype=np.float64)
@@ -195,7 +195,7 @@ class KalmanFilter(Copied):
                     f"Kalman filter: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are "
                     "needed. Give all of them"
                 )
-            u = as_block(given.reshape(n, self._n_u), self._n_u, "Kalman filter")
+            u = as_block(given.reshape(n, self._n_u), self._n_u)
         out = np.empty((n, self._n))
         self._run(y, u, out)
         return out[0] if raw.ndim == 0 or (raw.ndim == 1 and self._m > 1) else out

@@ -37,33 +37,30 @@ _FAR = 1e12  # variance of the start's error in units of step or of 1 / small, w
 _FLOAT = np.dtype(np.float64)
 
 
-class Recursion(Copied):
-    """State and interface of a recursion; its compiled loop is the only thing that differs."""
+class _Recursion(Copied):
+    """State and interface of a recursion with P and a companion of it in factors; its compiled loop is the only thing
+    that differs.
+    """
 
-    def __init__(
-        self, names: tuple[str, ...], width: int, size: int, start: ArrayLike | None, noise_sd: float | None
-    ) -> None:
-        p = len(names)
-        self._names, self._shape = names, (width,)
-        self._s = np.zeros(self._at.HEAD + size)
+    def __init__(self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None) -> None:
+        self._names = coefficient_names(names)
+        p = len(self._names)
+        self._shape, self._s = (p,), np.zeros(self._at.HEAD + 6 * p + 2 * p * p)
         self._s[self._at.SIZE] = p
         self._known_noise = None if noise_sd is None else positive("noise_sd", noise_sd) ** 2
         self._s[self._at.HEAD :][:p] = numbers("start", 0.0 if start is None else start, p)
-        self._one = (np.zeros((1, width)), np.zeros(1))
+        self._one = (np.zeros((1, p)), np.zeros(1))
 
     @property
     def _at(self) -> Any:
         """The compiled loops, which also know where the numbers lie."""
         return kernels("regression")
 
-    def _forget(self, factor: float | None, memory: float | None, limit: float) -> None:
-        """Set how fast old samples lose their weight, and how far."""
-        s, at = self._s, self._at
-        s[at.FACTOR] = s[at.FACTOR_NOW] = forgetting_factor(factor, memory)
-        s[at.MEMORY] = 1.0 / (1.0 - s[at.FACTOR]) if s[at.FACTOR] < 1.0 else np.inf
-        s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
-        s[at.LIMIT] = positive("limit", limit)
-        s[at.NOISE_RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY])
+    def _factors(self, which: int) -> Array:
+        """Return a view of the factors (p, p) of P (0) or of its companion (1)."""
+        p = len(self._names)
+        first = self._at.HEAD + p + which * p * p
+        return self._s[first : first + p * p].reshape(p, p)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -114,22 +111,7 @@ class Recursion(Copied):
         kernels("regression").regress(self._s, rows, y, out)
 
 
-class _Factored(Recursion):
-    """A recursion with P and a companion of it in factors."""
-
-    def __init__(self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None) -> None:
-        found = coefficient_names(names)
-        p = len(found)
-        super().__init__(found, p, 6 * p + 2 * p * p, start, noise_sd)
-
-    def _factors(self, which: int) -> Array:
-        """Return a view of the factors (p, p) of P (0) or of its companion (1)."""
-        p = len(self._names)
-        first = self._at.HEAD + p + which * p * p
-        return self._s[first : first + p * p].reshape(p, p)
-
-
-class RecursiveLeastSquares(_Factored):
+class RecursiveLeastSquares(_Recursion):
     """Recursive least squares, a `RecursiveEstimator`: O(p²) a sample, nothing inverted.
 
     Without `factor` or `memory` nothing is forgotten: the estimate is that of batch least squares with the same
@@ -191,12 +173,16 @@ class RecursiveLeastSquares(_Factored):
         super().__init__(names, start, noise_sd)
         s, p, at = self._s, len(self._names), self._at
         s[at.KIND] = at.LEAST_SQUARES
-        self._forget(factor, memory, limit)
+        s[at.FACTOR] = s[at.FACTOR_NOW] = forgetting_factor(factor, memory)
+        s[at.MEMORY] = 1.0 / (1.0 - s[at.FACTOR]) if s[at.FACTOR] < 1.0 else np.inf
+        s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
+        s[at.LIMIT] = positive("limit", limit)
+        s[at.NOISE_RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY])
         s[at.VAGUE] = float(prior is None)
         s[at.TYPICAL], s[at.NOW] = 0.1 * p, 1.0
         settle = _SETTLES * _NOISE_MEMORIES * s[at.MEMORY]
         s[at.SETTLED] = np.inf if noise_sd is not None else min(s[at.MEMORY], settle)
-        prior = prior_of("prior", VAGUE if prior is None else prior, p)
+        prior = prior_of(VAGUE if prior is None else prior, p)
         scale = np.sqrt(np.diag(prior))
         inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
         self._factors(0)[:] = factors_of(prior)
@@ -219,7 +205,7 @@ class RecursiveLeastSquares(_Factored):
         return np.asarray(unit * (half.T @ half))
 
 
-class _Gradient(_Factored):
+class _Gradient(_Recursion):
     """A recursion along the regressor, with the covariance of its error; `far` is the prior where none is given."""
 
     def __init__(
@@ -234,7 +220,7 @@ class _Gradient(_Factored):
         super().__init__(names, start, noise_sd)
         for name, value in {"FACTOR_NOW": 1.0, "NOISE_RATE": _NOISE_RATE, **head}.items():
             self._s[getattr(self._at, name)] = value
-        self._factors(1)[:] = factors_of(prior_of("prior", far if prior is None else prior, len(self._names)))
+        self._factors(1)[:] = factors_of(prior_of(far if prior is None else prior, len(self._names)))
 
     @property
     def covariance(self) -> Array:
