@@ -5,9 +5,9 @@ with predicted variances s (Ljung 1999, sec. 7.4; Astrom 1980), exact in state a
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick
 from ambid.estimation.search import PhysicalFit
 from ambid.estimation.search import search as descend
+from ambid.physics.sensor_errors import SensorError
 
 _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
@@ -29,6 +30,8 @@ _ABOUT = 4  # samples before and after a beginning that show where the rotor is 
 _BLOCK = 4096  # samples of one block: their rows stay near
 _DUST = 1e-9  # part of a weak prior that is left over where the records say nothing
 _LONGEST = 1.0  # step of a logarithm at once
+_ROLES = ("position", "current")
+_ERROR = 1e-4  # step of an error: relative, of an offset in the channel's spread
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -402,4 +405,59 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
         delay_sd=dict(zip(problem.rates, extra, strict=True)),
         inflation=float(ratio.max()),
         disagreement=np.zeros((0, n)),
+    )
+
+
+def bearing_moves(fit: BearingFit, errors: Sequence[SensorError]) -> Array:
+    """Return d theta/d e of the estimated numbers where channels, the time or fixed numbers are too large by e,
+    (n_estimated, n_errors), SI: -(J'J)^-1 d(J'r)/de, by which half the gradient stays zero, noise levels and delays
+    among what moves. LinAlgError where a record that is hardly changed has no predictor.
+    """
+    assert fit.at is not None
+    problem, vector, free = fit.problem, fit.vector, fit.vector < fit.problem.upper()
+    inverse = directions(fit.at.J[:, free]).inverse()
+
+    def half(error: SensorError, by: float) -> Array:
+        at = linearise(_with_error(problem, error, by), vector)
+        if at is None:
+            raise np.linalg.LinAlgError("no predictor")
+        return np.asarray(at.J.T @ at.r)
+
+    moved, chain = np.zeros((vector.size, len(errors))), problem.chain(vector)
+    for k, error in enumerate(errors):
+        step = _ERROR * _size(problem, error)
+        slope = (half(error, step) - half(error, -step)) / (2.0 * step)
+        moved[free, k] = -inverse @ slope[free]
+    return chain[:, None] * moved[: chain.size]
+
+
+def _size(problem: BearingProblem, error: SensorError) -> float:
+    """Return what an error is small beside: one, a fixed number, or for an offset the spread of its channel."""
+    if error.kind == "fixed":
+        return abs(next(n.value for n in problem.numbers if n.name == error.channel))
+    if error.kind == "gain":
+        return 1.0
+    moving = [r for r in problem.records if not r.held]
+    return float(
+        max(np.std(r.u if error.channel == "voltage" else r.y[:, _ROLES.index(error.channel)]) for r in moving)
+    )
+
+
+def _with_error(problem: BearingProblem, error: SensorError, by: float) -> BearingProblem:
+    """Return a problem in which a channel of all records, their time or a number that is known is too large."""
+    if error.kind == "fixed":
+        numbers = (replace(n, value=n.value + by) if n.name == error.channel else n for n in problem.numbers)
+        return replace(problem, numbers=tuple(numbers))
+    gain, offset = (1.0 + by, 0.0) if error.kind == "gain" else (1.0, by)
+    if error.channel == "time":
+        return replace(
+            problem, records=tuple(replace(r, rate_hz=r.rate_hz / gain) for r in problem.records),
+            delays={rate / gain: x for rate, x in problem.delays.items()},
+            free_delay=frozenset(rate / gain for rate in problem.free_delay),
+        )  # fmt: skip
+    if error.channel == "voltage":
+        return replace(problem, records=tuple(replace(r, u=gain * r.u + offset) for r in problem.records))
+    on = np.array([role == error.channel for role in _ROLES])
+    return replace(
+        problem, records=tuple(replace(r, y=np.where(on, gain * r.y + offset, r.y)) for r in problem.records)
     )

@@ -108,6 +108,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     criterion, bic : float
         Twice the negative log-likelihood but for constants, and with its price for each number.
     checks : Mapping[str, Check]
+    calibration, calibration_sd : Mapping
+        As of a linear `Estimate`; offsets that no number takes up are sources too, by an error of one SI unit.
     validation : Mapping[str, object] or None
         Results on a further record.
     warnings : tuple of str
@@ -136,6 +138,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     criterion: float
     bic: float
     checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
+    calibration: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MappingProxyType({}))
+    calibration_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     validation: Mapping[str, object] | None = None
     warnings: tuple[str, ...] = ()
     extended: tuple[str, ...] = ()
@@ -158,7 +162,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
         return None if delay is None else delay.samples + delay.fraction
 
     def curves(self, position: ArrayLike, current: ArrayLike) -> Curves:
-        """Return force, k_i, k_x and L at points, with standard deviations by the delta method.
+        """Return force, k_i, k_x and L at points, with standard deviations by the delta method, with calibration where
+        the rig says something of it.
 
         Parameters
         ----------
@@ -181,6 +186,10 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
             if name in self.covariance_names:
                 gradient[:, :, self.covariance_names.index(name)] -= self._along(true_x, true_i, point)
         variance = np.einsum("ncj,jk,nck->nc", gradient, self.covariance, gradient)
+        size = np.array([self.values[name] or 1.0 for name in self.covariance_names])
+        for source in self.calibration.keys() & self.calibration_sd.keys():
+            moves = np.array([self.calibration[source][name] for name in self.covariance_names])
+            variance += (self.calibration_sd[source] * gradient @ (size * moves)) ** 2
         sd = np.sqrt(np.maximum(variance, 0.0))
         force, k_x, k_i, ell = (
             Curve(unit=unit, value=table[:, c], sd=sd[:, c]) for c, unit in enumerate(("N", "N/m", "N/A", "H"))

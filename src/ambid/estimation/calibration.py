@@ -1,8 +1,8 @@
 """What errors of calibration do to an estimate: scales that a record cannot show, and its intervals with them.
 
 A channel whose gain is wrong, a sampling rate or a plane moves the estimate by d theta/d e for each unit of the error
-(`ambid.physics.sensor_errors`), and leaves little or nothing in the residuals. Errors are independent of each other and
-of the noise:
+(`linear_moves`; of a nonlinear bearing `bearing_moves` of its likelihood), and leaves little or nothing in the
+residuals. Errors are independent of each other and of the noise:
 
     variance = variance of the record + Σ (d theta/d e · sd of e)².
 
@@ -12,7 +12,7 @@ would be without.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeVar, cast
@@ -48,26 +48,27 @@ class _Source:
 
 def calibrated(
     estimate: E, rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str],
-    covariance: Array, lines: Sequence[Lines], *, weight: tuple[Array, Array] | None = None,
+    moves: Callable[[Sequence[SensorError]], Array], *, offsets: Mapping[str, str] | None = None,
 ) -> E:  # fmt: skip
     """Return an estimate with its intervals for what its rig says of calibration.
 
-    `theta`: all numbers of the `plant`, SI; `names`: those that were estimated, in the order of the `covariance` that
-    the records and priors give; `lines`: what the records show; `weight`: gain and slope of k_i/m over
-    what the weight asks for, by which it moved the estimate.
+    `theta`: all numbers, SI; `names`: those that were estimated, in the order of what `moves` returns, d theta/d e of
+    errors, (n_names, n_errors); `offsets`: of a law that is not linear, the number that is an offset, by channel: where
+    it is estimated, it takes up what the offset's error moves.
     """
-    made, sources, references = cast("Any", estimate), _sources(rig, plant, theta), plant.references(theta)
+    made, sources, own = cast("Any", estimate), _sources(rig, plant, theta), offsets or {}
+    sources |= {
+        f"{c.role}.offset": _Source(errors=[SensorError(kind="offset", channel=c.role)], sd=c.offset_sd)
+        for c in rig.channels
+        if c.offset_sd is not None and c.role in own and own[c.role] not in names
+    }
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
     try:
-        moved = _moved(rig, plant, theta, names, errors, covariance, lines)
+        moved = moves(errors)
     except np.linalg.LinAlgError:  # an estimate far from a plant, such as one that did not converge
         return estimate
-    if weight is not None:
-        gain, slope = weight
-        by_weight = np.array([-float(e == SensorError(kind="gain", channel="current")) for e in errors])
-        moved += np.outer(gain, by_weight - slope @ moved)
     lengths = {p.name for p in plant.parameters if p.unit == "m"}
-    size = np.array([references[name] if name in lengths else theta[name] or 1.0 for name in names])
+    size = np.array([plant.references(theta)[name] if name in lengths else theta[name] or 1.0 for name in names])
     calibration, variance = dict[str, Mapping[str, float]](), np.zeros(len(names))
     for name, s in sources.items():
         column = np.sum([moved[:, errors.index(e)] for e in s.errors], axis=0)
@@ -75,12 +76,33 @@ def calibrated(
         share = column * s.whole / size
         calibration[name] = dict(zip(names, np.where(abs(share) < _DUST, 0.0, share).tolist(), strict=True))
     stated = {name: s.sd for name, s in sources.items() if s.sd is not None}
-    offsets = {f"{c.role}.offset": c.offset_sd for c in rig.channels if c.offset_sd is not None}
+    all_offsets = {f"{c.role}.offset": c.offset_sd for c in rig.channels if c.offset_sd is not None}
     spread = dict(zip(names, np.sqrt(variance).tolist(), strict=True))
     parameters = tuple(_widened(p, spread.get(p.name, 0.0)) if stated else p for p in estimate.parameters)
     return cast(
-        "E", replace(made, parameters=parameters, calibration=calibration, calibration_sd={**stated, **offsets})
+        "E", replace(made, parameters=parameters, calibration=calibration, calibration_sd={**stated, **all_offsets})
     )
+
+
+def linear_moves(
+    rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str], covariance: Array,
+    lines: Sequence[Lines], errors: Sequence[SensorError], *, weight: tuple[Array, Array] | None = None,
+) -> Array:  # fmt: skip
+    """Return d theta/d e of a linear model, (n_names, n_errors), SI.
+
+    `covariance`: what records and priors give, of the first of `names` on which there may be priors; `lines`: what the
+    records show; `weight`: gain and slope of k_i/m over what the weight asks for, by which it moved the estimate.
+    """
+    references, n = plant.references(theta), len(covariance)
+    moved = error_moves(plant, theta, errors, free=names, lines=lines)
+    moved *= np.array([theta[name] or references.get(name, 1.0) for name in names])[:, None]
+    weights = {p.name: p.sd**-2 for p in rig.parameters if p.role == "prior" and p.sd}
+    moved[:n] -= covariance @ (np.array([weights.get(name, 0.0) for name in names[:n]])[:, None] * moved[:n])
+    if weight is not None:
+        gain, slope = weight
+        by_weight = np.array([-float(e == SensorError(kind="gain", channel="current")) for e in errors])
+        moved += np.outer(gain, by_weight - slope @ moved)
+    return moved
 
 
 def explaining(
@@ -96,7 +118,7 @@ def explaining(
     out = dict[str, tuple[float, Array]]()
     sources = {name: s for name, s in _sources(rig, plant, theta).items() if s.errors[0].kind == "gain"}
     try:
-        moved = _moved(rig, plant, theta, names, [s.errors[0] for s in sources.values()], covariance, lines)
+        moved = linear_moves(rig, plant, theta, names, covariance, lines, [s.errors[0] for s in sources.values()])
     except np.linalg.LinAlgError:
         return out
     for (name, s), column in zip(sources.items(), moved.T, strict=True):
@@ -106,19 +128,6 @@ def explaining(
         if abs(size) < min(_UNIT, np.inf if s.sd is None else _RULED_OUT * s.sd):
             out[name] = size, size * whole
     return out
-
-
-def _moved(
-    rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str],
-    errors: Sequence[SensorError], covariance: Array, lines: Sequence[Lines],
-) -> Array:  # fmt: skip
-    """Return d theta/d e, (n_names, n_errors), SI."""
-    references, n = plant.references(theta), len(covariance)
-    moved = error_moves(plant, theta, errors, free=names, lines=lines)
-    moved *= np.array([theta[name] or references.get(name, 1.0) for name in names])[:, None]
-    weights = {p.name: p.sd**-2 for p in rig.parameters if p.role == "prior" and p.sd}
-    moved[:n] -= covariance @ (np.array([weights.get(name, 0.0) for name in names[:n]])[:, None] * moved[:n])
-    return moved
 
 
 def _sources(rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float]) -> dict[str, _Source]:
@@ -131,10 +140,11 @@ def _sources(rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, floa
     # a rate that is too high makes times too short
     sources["rate"] = _Source(errors=[SensorError(kind="gain", channel="time")], sd=rig.record.rate_sd, whole=-1.0)
     if not isinstance(plant, RotorModel):
+        known = rig.parameters if rig.magnet is None else (*rig.parameters, *rig.magnet.parameters)
         return sources | {
             p.name: _Source(errors=[SensorError(kind="fixed", channel=p.name)], sd=None, whole=theta[p.name])
-            for p in rig.parameters
-            if p.role == "fixed" and p.value
+            for p in known
+            if p.role == "fixed" and p.value and p.name in theta
         }
     fixed, span = {p.name for p in rig.parameters if p.role == "fixed"}, plant.span(theta)
     for b in (b for b in plant.bearings if not b.axial):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
@@ -300,7 +301,7 @@ def _judged(
     """
     from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
-    from ambid.estimation.calibration import calibrated, lines_of
+    from ambid.estimation.calibration import calibrated, linear_moves, lines_of
     from ambid.estimation.likelihood import free_one, innovations, simulation_error
     from ambid.validation import physical
     from ambid.validation.facts import informed
@@ -373,8 +374,9 @@ def _judged(
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
-    lines = [lines_of(fit)]
-    return calibrated(estimate, rig, problem.model, theta, spread.names, alone, lines, weight=used), named
+    known = rig, problem.model, theta, spread.names
+    moves = partial(linear_moves, *known, alone, [lines_of(fit)], weight=used)
+    return calibrated(estimate, *known, moves), named
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, Unpack
 
 import numpy as np
@@ -16,10 +17,11 @@ from scipy.spatial import ConvexHull
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_estimate import PARTS
-from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
+from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, bearing_moves
 from ambid.bearing.magnet_problem import LEVELS, UNITS, BearingRecord, touching, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError, counted
+from ambid.estimation.calibration import calibrated
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit, warnings_of
 from ambid.estimation.progress import Tick
 from ambid.estimation.uncertainty import WEAK
@@ -46,6 +48,7 @@ _SAME = 1e-9  # part of a channel's spread that another one leaves over, at or b
 _ROCKS = 0.25  # spread of a held position over that of the moving ones from which it is told
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
 _ROLES = ("position", "current")
+_OFFSETS = {"voltage": "v_offset", "current": "i_offset", "position": "x_offset"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -290,7 +293,7 @@ def judge_bearing(
     moving = np.concatenate([r.kept for r in problem.records if not r.held])
     changed = tuple(w for t in readings for w in t.warnings)
     delays = _delays(fit, spread, given=rig.channel("voltage").delay != "auto")
-    return NonlinearBearingEstimate(
+    estimate = NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
         law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in readings),
         parameters=parameters, covariance_names=spread.names, covariance=spread.covariance(robust=wide),
@@ -303,6 +306,9 @@ def judge_bearing(
         extended=("drift",) * (problem.drift and not (rig.magnet is not None and rig.magnet.drift)),
         warnings=_warnings(fit, checks, robust=robust) + changed,
     )  # fmt: skip
+    return calibrated(
+        estimate, rig, rig.plant, estimate.values, spread.names, partial(bearing_moves, fit), offsets=_OFFSETS
+    )
 
 
 def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict[str, Delay]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import isfinite, pi
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -52,7 +53,7 @@ def identify_rotor(
     the predictor. `speed_rpm`: of each record; `apart`: their synchronous parts, where each is one experiment whose
     part is known; `reading`: of files. EstimationError where nothing can be identified.
     """
-    from ambid.estimation.calibration import calibrated
+    from ambid.estimation.calibration import calibrated, linear_moves
     from ambid.job.closed_loop import loop_and_peaks
     from ambid.rotor.conclusion import conclude, lines_seen
     from ambid.rotor.synchronous import separate
@@ -89,8 +90,9 @@ def identify_rotor(
         )  # fmt: skip
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
         names = tuple(name for name in estimate.covariance_names if name in estimate.numbers)
-        covariance, seen = estimate.covariance_of(names), lines_seen(outcome.fit)
-        estimate = calibrated(estimate, rig, estimate.plant, estimate.numbers, names, covariance, seen)
+        known = rig, estimate.plant, estimate.numbers, names
+        moves = partial(linear_moves, *known, estimate.covariance_of(names), lines_seen(outcome.fit))
+        estimate = calibrated(estimate, *known, moves)
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
         loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], outcome.seen[fastest], estimate.speed)
         try:

@@ -112,13 +112,12 @@ def estimate_document(estimate: AnyEstimate, evidence: Callable[[], Evidence | B
     e, linear = estimate, isinstance(estimate, Estimate)
     meanings = {spec.name: spec.meaning for spec in (*model(e.model).parameters, *BEARING_NUMBERS)}
     table = parameter_table(e.parameters, e.verdict, meanings)
-    said = [Lines(lines=calibration_lines(e), indent=2)] if isinstance(e, Estimate) else []
     note = f"{_SIGNS} Standard deviations are from the {_SOURCES[e.covariance_method]}."
     warnings = Section(parts=[Warnings(warnings=other_warnings(e.checks, e.warnings))])
     sections = [
         Section(parts=header(e), page=False),
         *([] if linear else [warnings]),
-        Section(title="Parameters", parts=[table, *said], note=note),
+        Section(title="Parameters", parts=[table, Lines(lines=calibration_lines(e), indent=2)], note=note),
         correlations_section("Correlations of the estimated parameters", e.covariance_names, e.covariance),
         *([] if isinstance(e, Estimate) else [_curves(e)]),
         Section(title="Delay and fit", parts=[Lines(lines=delay_lines(e))]),

@@ -17,6 +17,7 @@ from ambid.report.numbers import Quantity, quantity, sized
 from ambid.report.text import WORDS, Cell, fraction, names_words, pure
 
 if TYPE_CHECKING:
+    from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.rotor.estimate import RotorEstimate
 
 USABLE = Verdict(word="usable", reasons=())
@@ -213,10 +214,12 @@ def pole_table(
 _FELT, _LINEAR = 0.05, 100.0  # per cent: less is not shown, and more is of a number that the record does not show
 
 
-def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
+def calibration_lines(estimate: Estimate | NonlinearBearingEstimate | RotorEstimate) -> list[str]:
     """Say what 1 % of each scale would move that the rig says nothing of; channels of one kind together."""
     e, stated = estimate, estimate.calibration_sd
     fixed = [name for name in e.calibration if any(p.name == name for p in e.parameters)]
+    law = any(p.name == "x_offset" for p in e.parameters)  # of a nonlinear bearing, some of whose numbers may be unseen
+    unseen = {p.name for p in e.parameters if law and p.sd > abs(p.value)}
     kinds, worst = dict[str, dict[str, float]](), dict[str, tuple[float, str]]()  # channels of a kind; by bearing
     for source, moves in e.calibration.items():
         bearing, dot, _ = source.partition(".")
@@ -229,7 +232,7 @@ def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
         own = f"{source} (fixed)" if source in fixed else source.rpartition("_")[2].rstrip("0123456789")
         kind = kinds.setdefault(own, dict.fromkeys(moves, 0.0))
         for name, x in moves.items():
-            kind[name] += x
+            kind[name] += 0.0 if name in unseen else x
     words = [f"{kind} {moved}" for kind, moves in kinds.items() if (moved := _grouped(_shown(moves)))]
     planes = [text for x, text in worst.values() if x >= _FELT]
     first = "Some of the calibration is in no interval. " if stated else "Intervals are from this record alone. "
@@ -245,8 +248,11 @@ def calibration_lines(estimate: Estimate | RotorEstimate) -> list[str]:
         span = e.plant.span(e.numbers)  # type: ignore[union-attr]  # only rotors have planes
         off = f"{sized(0.01 * span, 'm')} along the shaft moves most: {'; '.join(planes)}"
         lines.append(f"{'' if words else first}{off}. Give z_sd or z_sensor_sd")
-    offsets = [name.removesuffix(".offset") for name in stated if name.endswith(".offset")]
-    return [*lines, *([f"An offset of {names_words(offsets)} moves the operating point alone"] if offsets else [])]
+    offsets = [
+        name.removesuffix(".offset") for name in stated if name.endswith(".offset") and name not in e.calibration
+    ]
+    only = "the number that stands for it" if law else "the operating point"
+    return [*lines, *([f"An offset of {names_words(offsets)} moves {only} alone"] if offsets else [])]
 
 
 def _shown(moves: Mapping[str, float]) -> dict[str, float]:
