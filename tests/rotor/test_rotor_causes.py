@@ -208,6 +208,7 @@ def test_a_plane_and_a_gain_are_named_without_whole_periods(sound: Any) -> None:
     plain = ambid.identify(record, rig)
     assert plain.verdict.word == "usable"
     assert "were not asked of" in plain.checks["sensors_agree"].detail
+    assert plain.checks["uncertainty_consistent"].passed
     assert {"A.z", "A.z_sensor"} >= set(named(record, moved(rig, A__z_sensor=5e-3), "fixed_agree"))
     causes = named(changed(record, ax_position=lambda x: 1.05 * x), rig, "sensors_agree")
     assert causes[0] == "ax_position.gain"
@@ -386,3 +387,23 @@ def test_curvature_of_the_magnets_is_named_and_within_the_intervals(seed: int) -
     assert "curvature of the magnets shows" in large.checks["curvature"].detail
     assert small.verdict.word == "usable"
     assert "no curvature" in small.checks["curvature"].detail
+
+
+def bent(record: Record) -> Record:
+    """The record with voltages of which 2 % are cubic, without the linear part of that."""
+    of = {c.name: c.name.endswith("_voltage") for c in record.channels}
+    return changed(record, **{name: cubic for name, is_voltage in of.items() if is_voltage})
+
+
+def cubic(v: Any) -> Any:
+    power = np.mean(v**2)
+    return v + 0.02 * (v**3 / power - v * np.mean(v**4) / power**2)
+
+
+def test_what_no_cause_explains_widens_the_intervals(sound: Any) -> None:
+    found = ambid.identify(bent(sound[0][0.0:0.45]), sound[1])
+    assert found.verdict.word == "caution"
+    assert not found.checks["residuals_white"].passed
+    assert "the intervals hold how far its parts disagree" in found.checks["residuals_white"].detail
+    theta = model_of(replace(truth.BENCHES["rigid"], period=0.25))[1]
+    assert not [p.name for p in found.parameters if p.sd and abs(p.value - theta[p.name]) > 3.8 * p.sd]

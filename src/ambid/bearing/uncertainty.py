@@ -141,7 +141,7 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
     return Uncertainty(
         names=problem.estimated,
         information=information,
-        robust=(_gram(whole[:n] @ _scatter(_scores(fit) if scores is None else scores).T) + more) * unit,
+        robust=(_gram(whole[:n] @ scatter(_scores(fit) if scores is None else scores).T) + more) * unit,
         data_only_sd=data_only,
         scale=scale,
         singular_values=singular_values,
@@ -225,7 +225,7 @@ def _scores(fit: Fit) -> Array:
     return sums.scores
 
 
-def _scatter(scores: Array) -> Array:
+def scatter(scores: Array) -> Array:
     """Rows whose squares are the middle of the sandwich: scores less their mean."""
     count = scores.shape[0]
     return np.asarray((scores - scores.mean(axis=0)) * np.sqrt(count / max(count - 1, 1)))

@@ -35,7 +35,7 @@ _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
 _LIMIT_SHARE = 0.05  # of the mean square, above which they matter
 _LENGTH_SEEN = 0.25
-_FOLD = 3.0  # logarithm of a number by which a cause may move it: beyond, it is not identifiable in any case
+FOLD = 3.0  # logarithm of a number by which a cause may move it: beyond, it is not identifiable in any case
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,7 +125,7 @@ def shifts_of(fit: Ending, found: Sequence[Score]) -> list[Array]:
     logs = [k for k, x in enumerate(fit.unknowns.names) if k < len(fit.unknowns.logs) or x.endswith(".l")]
     for s in suspects(found):
         shift = s.shift[:n].copy()
-        shift[logs] = np.clip(shift[logs], -_FOLD, _FOLD)
+        shift[logs] = np.clip(shift[logs], -FOLD, FOLD)
         points = (fit.point, replace(fit, vector=fit.vector - shift).point)
         is_now, would_be = (np.array([*(p.theta[x] for x in names), *p.delays[free]]) for p in points)
         spread = chain[[*range(len(names)), *(len(names) + k for k in free)]] @ s.spread[:n]

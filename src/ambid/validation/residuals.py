@@ -25,6 +25,7 @@ from ambid.estimation.result import NORMAL_95
 from ambid.estimation.uncertainty import chi_squared_tail, p_text
 
 P_LEAST = 1e-3  # 99.9 % bounds
+_INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _SEEN = 1e-3  # part of a regressor that J must leave for it to be tested
 _SAME = 1e-6  # the same where several residuals are tested together: lags of a slow input are nearly one column
 _PREDICTED = 1e-16  # power from which a residual is more than rounding
@@ -568,3 +569,12 @@ def _check_feedback(tests: ResidualTests, test: ResidualTest, subject: Subject) 
         values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(visible)},
         detail=f"{detail} ({p_text(test.p)})",
     )
+
+
+def consistent_check(inflation: float) -> Check:
+    """Judge by how much robust standard deviations are larger than those from the information matrix."""
+    return Check(
+        passed=inflation < _INFLATION, values={"inflation": inflation},
+        detail=f"robust standard deviations are up to {inflation:.2f} times those from the information matrix (limit "
+        f"{_INFLATION:g})",
+    )  # fmt: skip

@@ -14,21 +14,22 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.bearing.sizes import check_units
-from ambid.bearing.uncertainty import noise_levels
+from ambid.bearing.uncertainty import noise_levels, scatter
 from ambid.estimation.colours import colours_of
 from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.likelihood import Fit, innovations
+from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
-from ambid.rotor.conclusion import Evidence, shifts_of
+from ambid.rotor.conclusion import FOLD, Evidence, numbers_of, shifts_of
 from ambid.rotor.prediction import PredictorFit, predictor_scores, searched_of
 from ambid.rotor.scores import agreement_checks, suspects
 from ambid.rotor.spectra import beside_harmonics
-from ambid.validation.physical import innovation_products, innovation_tests
-from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
+from ambid.validation.physical import by_bands, innovation_products, innovation_tests
+from ambid.validation.residuals import consistent_check, fit_of, uncorrelated_check, white_check
 
 
 def of_predictor(found: PredictorFit) -> Evidence:
@@ -37,11 +38,21 @@ def of_predictor(found: PredictorFit) -> Evidence:
     e = innovations(problem, fit.vector, fit.work)
     if e is None:
         raise ValueError("the fit has no predictor; it has failed")
-    white, past = innovation_tests(fit, innovation_products(fit, e))
+    sums = innovation_products(fit, e)
+    white, past = innovation_tests(fit, sums)
     e = e * problem.scales.output
     share, size = fit_of(e, problem.y[problem.skip :]), np.sqrt(np.mean(e**2, axis=0))
     causes = predictor_scores(found)
     checks = {"residuals_white": _told(white_check(white), fit), "residuals_uncorrelated": uncorrelated_check(past)}
+    shifts, robust = shifts_of(found, causes), _robust(found, sums.scores)
+    own = np.diag(numbers_of(found).covariance)
+    checks["uncertainty_consistent"] = consistent_check(float(np.sqrt(np.max(robust / own))))
+    if not shifts and not all(c.passed for c in checks.values()):
+        shifts = [*np.diag(np.sqrt(np.maximum(robust - own, 0.0))), *_by_bands(found)]
+        checks = {
+            name: c if c.passed else replace(c, detail=f"{c.detail}; the intervals hold how far its parts disagree")
+            for name, c in checks.items()
+        }
     return Evidence(
         method="predictor",
         noise=_noise(fit),
@@ -49,13 +60,32 @@ def of_predictor(found: PredictorFit) -> Evidence:
             role: OutputFit(one_step=float(a), simulation=None, innovation_sd=float(b))
             for role, a, b in zip(found.model.outputs, share, size, strict=True)
         },
-        shifts=shifts_of(found, causes),
+        shifts=shifts,
         checks={
             **checks,
             **_asked(agreement_checks(causes, found.model)),
             **({} if suspects(causes) else _line_check(e, found, problem.rate_hz)),
         },
     )
+
+
+def _chain(found: PredictorFit) -> Array:
+    """Return the derivatives of `Numbers.names` by the unknowns."""
+    names, chain = found.unknowns.chain(found.vector)
+    return chain[[*range(len(names)), *(len(names) + k for k in found.unknowns.free_delays)]]
+
+
+def _robust(found: PredictorFit, scores: Array) -> Array:
+    """Return the variance of each number by the scatter of stretches of the record."""
+    fit, chain = found.fit, _chain(found)
+    whole = directions(np.vstack([fit.J, fit.J_prior])).inverse()[: chain.shape[1]]
+    return np.asarray(np.sum((chain @ whole @ scatter(scores).T) ** 2, axis=1))
+
+
+def _by_bands(found: PredictorFit) -> Array:
+    """Return how far each number moves without bands of the record, (n_bands, n_numbers)."""
+    moves = by_bands(found.fit)
+    return np.asarray(np.clip(moves, -FOLD, FOLD) @ _chain(found)[:, : moves.shape[1]].T)
 
 
 def _told(check: Check, fit: Fit) -> Check:
