@@ -407,3 +407,9 @@ def test_what_no_cause_explains_widens_the_intervals(sound: Any) -> None:
     assert "the intervals hold how far its parts disagree" in found.checks["residuals_white"].detail
     theta = model_of(replace(truth.BENCHES["rigid"], period=0.25))[1]
     assert not [p.name for p in found.parameters if p.sd and abs(p.value - theta[p.name]) > 3.8 * p.sd]
+
+
+def test_what_is_unusable_has_no_number_that_is_identifiable(sound: Any) -> None:
+    found = ambid.identify(bent(sound[0]), sound[1])
+    assert (found.method, found.verdict.word) == ("periods", "unusable")
+    assert {p.role for p in found.parameters if p.identifiable} <= {"fixed"}

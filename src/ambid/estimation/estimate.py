@@ -8,7 +8,7 @@ import json
 import math
 import types
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import PurePath
 from types import MappingProxyType
@@ -126,6 +126,18 @@ class Judged(Result):
         second = (getattr(self, "validation", None) or {}).get("checks", {})
         failed += [Reason(check=f"validation.{k}", text=c["detail"]) for k, c in second.items() if not c["passed"]]
         return tuple(failed)
+
+
+E = TypeVar("E", bound=Parametric)
+
+
+def disowned(estimate: E) -> E:
+    """Return an estimate; where its own checks let none of it be used, no number of it is identifiable."""
+    made = cast("Any", estimate)
+    if made.verdict.word != "unusable":
+        return estimate
+    parameters = tuple(replace(p, identifiable=p.role == "fixed") for p in estimate.parameters)
+    return cast("E", replace(made, parameters=parameters))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

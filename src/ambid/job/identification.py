@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate, plain_json, warnings_of
+from ambid.estimation.estimate import Estimate, disowned, plain_json, warnings_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.uncertainty import chi_squared_tail
@@ -234,10 +234,7 @@ def identify_axis(
         clock.split("fit", "global_search", float(str(fit.global_search["seconds"])))
     say("check")
     with one_thread():
-        estimate = _grown(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
-        if estimate.verdict.word == "unusable":  # its own checks disown every number
-            disowned = tuple(replace(p, identifiable=p.role == "fixed") for p in estimate.parameters)
-            estimate = replace(estimate, parameters=disowned)
+        estimate = disowned(_grown(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given"))
         if "reference" in bench or (rig.loop is not None and not rig.open_loop):
             from ambid.job.closed_loop import loop_and_peaks
 
@@ -472,7 +469,7 @@ def identify_nonlinear(
         )
     clock.lap("fit")
     say("check")
-    estimate = judge_bearing(fit, uncertainty(fit), readings, bench)
+    estimate = disowned(judge_bearing(fit, uncertainty(fit), readings, bench))
     clock.lap("checks")
     estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=readings)
     if second is not None:

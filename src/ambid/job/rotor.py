@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError, RecordError, counted
-from ambid.estimation.estimate import Check
+from ambid.estimation.estimate import Check, disowned
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, load_bench, origin, overlap, rig_entry, stretch_of
@@ -92,7 +92,7 @@ def identify_rotor(
         names = tuple(name for name in estimate.covariance_names if name in estimate.numbers)
         known = rig, estimate.plant, estimate.numbers, names
         moves = partial(linear_moves, *known, estimate.covariance_of(names), lines_seen(outcome.fit))
-        estimate = calibrated(estimate, *known, moves)
+        estimate = disowned(calibrated(estimate, *known, moves))
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
         loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], outcome.seen[fastest], estimate.speed)
         try:
