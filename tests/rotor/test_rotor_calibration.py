@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ambid
+from ambid.estimation.calibration import moved_by_sd
 from tests.estimation.test_calibration import wrong
 from tests.report import rotor_record
 from tests.tiers import sample
@@ -92,12 +93,17 @@ def test_variance_is_that_of_the_record_and_of_each_error():
     estimate = ambid.identify(rotor_record.record(), rig)
     assert estimate.calibration_sd["A.z_sensor"] == 5e-4
     assert {"A.z", "bx_voltage"}.isdisjoint(estimate.calibration_sd)
+    names = [p.name for p in estimate.parameters if p.sd]
+    moved = moved_by_sd(estimate, names)
     for p in estimate.parameters:
         size, variance = SPAN if p.unit == "m" else p.value, p.sd**2
         for source, x in estimate.calibration_sd.items():
             by = estimate.calibration[source].get(p.name, 0.0) * size
             variance += (by * x / (SPAN if "." in source else 1.0)) ** 2
         assert p.sd_calibrated == pytest.approx(np.sqrt(variance), rel=1e-6)
+        if p.sd:  # as estimates are compared
+            apart = sum(x[names.index(p.name)] ** 2 for x in moved.values())
+            assert apart == pytest.approx(variance - p.sd**2, rel=1e-6)
 
 
 def test_it_comes_back_from_its_file(tmp_path):

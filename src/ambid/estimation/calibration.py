@@ -105,6 +105,24 @@ def linear_moves(
     return moved
 
 
+def moved_by_sd(estimate: Any, names: Sequence[str]) -> dict[str, Array]:
+    """Return by what one standard deviation of each error that the rig states moves numbers, SI, as `calibrated` counts
+    it; none of an estimate that knows no calibration.
+    """
+    sds, shares = getattr(estimate, "calibration_sd", {}), getattr(estimate, "calibration", {})
+    plant, size, planes = getattr(estimate, "plant", None), {n: estimate[n].value or 1.0 for n in names}, 1.0
+    known = {"rate"}
+    if isinstance(plant, RotorModel):  # lengths and planes count against the span
+        lengths, references = {p.name for p in plant.parameters if p.unit == "m"}, plant.references(estimate.numbers)
+        size |= {n: references[n] for n in lengths.intersection(names)}
+        known, planes = known.union(plant.inputs, plant.outputs), plant.span(estimate.numbers)
+    return {
+        channel: np.array([shares[channel].get(n, 0.0) * size[n] for n in names]) * sds[channel]
+        / (1.0 if channel in known else planes)
+        for channel in sds.keys() & shares.keys()
+    }  # fmt: skip
+
+
 def explaining(
     rig: Rig, plant: LinearModel, theta: Mapping[str, float], names: Sequence[str], covariance: Array,
     lines: Sequence[Lines], slope: Array, far: float, *, own: Mapping[str, float] | None = None,

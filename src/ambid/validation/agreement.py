@@ -10,6 +10,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.estimation.calibration import moved_by_sd
 from ambid.estimation.estimate import Check
 from ambid.estimation.result import Reason, Result
 from ambid.estimation.uncertainty import chi_squared_tail, p_text
@@ -109,10 +110,8 @@ def _covariance(
     for e, x, y in zip(estimates, a, b, strict=True):
         at = [e.covariance.names.index(n) for n in names]
         total += x * y * np.asarray(e.covariance)[np.ix_(at, at)]
-        sds, by_channel = getattr(e, "calibration_sd", {}), getattr(e, "calibration", {})
         rig = str(getattr(e, "rig", {}).get("text", ""))
-        for channel in sds.keys() & by_channel.keys():
-            per_sd = np.array([e[n].value * by_channel[channel].get(n, 0.0) for n in names]) * sds[channel]
+        for channel, per_sd in moved_by_sd(e, names).items():
             u, v = moves.get((rig, channel), (0.0, 0.0))
             moves[rig, channel] = (u + x * per_sd, v + y * per_sd)
     return total + sum((np.outer(u, v) for u, v in moves.values()), np.zeros_like(total))
