@@ -123,6 +123,14 @@ def test_a_rig_gives_physical_parameters(folder, ambid):
         assert f"\n{name} " in found.out
 
 
+def test_scales_that_the_rig_states_are_said_to_be_in_no_interval(folder, ambid):
+    text = (folder / "rig.toml").read_text()
+    (folder / "rig.toml").write_text(text.replace("[channels.position]", "[channels.position]\ngain_sd = 0.01", 1))
+    found = ambid("frf", "loop.csv", "--rig", "rig.toml", *REFERENCE, "--json", "a.json")
+    assert found.code == 0, found.err
+    assert "no interval holds channels.position.gain_sd of the rig" in " ".join((folder / "a.json").read_text().split())
+
+
 def test_the_figure_is_drawn_with_models_over_it(folder, ambid):
     words = ("frf", "loop.csv", "--rig", "rig.toml", *REFERENCE, "--orders", "nf=4", "--plot", "a.png")
     assert ambid(*words).code == 0

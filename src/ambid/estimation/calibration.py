@@ -105,6 +105,15 @@ def linear_moves(
     return moved
 
 
+def left_out(rig: Rig) -> tuple[str, ...]:
+    """Return a warning of a result whose intervals hold nothing of the calibration that its rig states."""
+    stated = [f"channels.{c.role}.gain_sd" for c in rig.channels if c.gain_sd is not None]
+    stated += ["record.rate_sd"] if rig.record.rate_sd is not None else []
+    if not stated:
+        return ()
+    return (f"no interval holds {', '.join(stated)} of the rig: they are of noise alone. 'ambid identify' holds both",)
+
+
 def moved_by_sd(estimate: Any, names: Sequence[str]) -> dict[str, Array]:
     """Return by what one standard deviation of each error that the rig states moves numbers, SI, as `calibrated` counts
     it; none of an estimate that knows no calibration.

@@ -280,6 +280,7 @@ def physics(found: BlackBoxFit, rig: RigSource) -> PhysicalFit:
         If the fit cannot carry the model: inputs, outputs, poles or a covariance are missing.
     """
     from ambid.bearing.physical import physical_parameters
+    from ambid.estimation.calibration import left_out
 
     bench = known_rig(rig)
     if bench.rotor is not None:
@@ -290,10 +291,11 @@ def physics(found: BlackBoxFit, rig: RigSource) -> PhysicalFit:
         )
     plant = model(bench.model)
     try:
-        return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
+        fit = physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
     except EstimationError as refusal:  # for a reason that the record may give
         reasons = [r.text for r in found.reasons if r.cause]
         raise EstimationError(". Further: ".join([*reasons, str(refusal)])) from None
+    return replace(fit, warnings=(*fit.warnings, *left_out(bench)))
 
 
 @of_job("compare")

@@ -378,9 +378,11 @@ def _fit_model(
 def _identify(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> FrequencyEstimate:
     """Estimate the rig's parameters; a delay in s is so many samples."""
     from ambid.bearing.frequency import greybox_frf
+    from ambid.estimation.calibration import left_out
 
     plant = model(rig.model)
     known: Delay = rig.channel(plant.inputs[0]).delay if delay is None else delay
     if delay is not None and known != "auto":
         known = float(known) * response.rate_hz
-    return greybox_frf(response, plant, rig.parameters, delay=known)
+    found = greybox_frf(response, plant, rig.parameters, delay=known)
+    return replace(found, warnings=(*found.warnings, *left_out(rig)))
