@@ -207,7 +207,7 @@ def test_a_plane_and_a_gain_are_named_without_whole_periods(sound: Any) -> None:
     record, rig = sound[0][0.0:0.45], sound[1]
     plain = ambid.identify(record, rig)
     assert plain.verdict.word == "usable"
-    assert "were not asked of" in plain.checks["sensors_agree"].detail
+    assert "were not asked of eddy currents or of curvature" in plain.checks["sensors_agree"].detail
     assert plain.checks["uncertainty_consistent"].passed
     assert {"A.z", "A.z_sensor"} >= set(named(record, moved(rig, A__z_sensor=5e-3), "fixed_agree"))
     causes = named(changed(record, ax_position=lambda x: 1.05 * x), rig, "sensors_agree")

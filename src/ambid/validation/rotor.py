@@ -114,7 +114,10 @@ def _asked(checks: dict[str, Check]) -> dict[str, Check]:
     fine = checks.get("sensors_agree")
     if fine is None or not fine.passed:
         return checks
-    text = "no gain, lag or cross-talk of a channel shows in the innovations, which were not asked of eddy currents"
+    text = (
+        "no gain, lag or cross-talk of a channel shows in the innovations, which were not asked of eddy currents or of "
+        "curvature of the magnets"
+    )
     return {**checks, "sensors_agree": replace(fine, detail=text)}
 
 
