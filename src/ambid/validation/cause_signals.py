@@ -146,8 +146,8 @@ TEXT = {
     "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
     "cross_talk": "the {channel} holds a part of voltage or current: cross-talk, or it is logged a sample after the "
     "voltage that answers it. Check cables, grounds, and that all channels are of one instant",
-    "r_drift": "the resistance drifts by {size:.3g} ohm from the middle of the record to its end: the coil warms up. "
-    "Record shorter, or after it is warm",
+    "r_drift": "the resistance drifts by {size:.3g} ohm from the middle to the end of the record, or of the busiest "
+    "100,000 samples of a longer one: the coil warms up. Record shorter, or after it is warm",
     "dead_time": "the coil gets {size:.3g} V less than logged, against the direction of its current: dead time or the "
     "drop of a diode. Compensate it, or log the coil's voltage",
     "friction": "a force of {size:.3g} N acts against the motion, whatever its speed: dry friction. Free the rotor",
