@@ -1,4 +1,4 @@
-"""The check that tells whether a fraction of a sample of delay can hide in a parameter."""
+"""The checks that tell whether a delay can hide in a parameter, and whether fixed values hold."""
 
 from dataclasses import replace
 
@@ -60,3 +60,15 @@ def test_a_delay_that_is_given_leaves_nothing_unseen():
         estimate, off = judged(3.0, 0.15, seed, given=0.15)
         assert estimate.checks["delay_shown"].passed
         assert abs(off) < 3.3
+
+
+def test_a_fixed_value_of_which_nothing_can_be_told_does_not_pass(monkeypatch):
+    monkeypatch.setattr("ambid.estimation.likelihood.free_one", lambda fit, name: (np.nan, np.full(1, np.nan)))
+    u = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 100), 10)
+    plant = LinearPlant(model=model("coil"), parameters={"R": 2.0, "L": 0.01})
+    record = simulate(plant, u, rate_hz=RATE, seed=1, noise=Noise.held(rate_hz=RATE, current=0.02)).record
+    rig = default_rig("coil")
+    known = (replace(p, role="fixed", value=2.0) if p.name == "R" else p for p in rig.parameters)
+    check = identify(record, replace(rig, parameters=tuple(known))).checks["fixed_agree"]
+    assert not check.passed
+    assert "cannot be told" in check.detail

@@ -290,7 +290,9 @@ def _fixed_agree(fit: Fit, freed: Freed) -> Check:
     worst, most, detail = 1.0, 0.0, "the data agree with every fixed value"
     for name, (statistic, step) in freed.items():
         value, p = fit.problem.known[name], chi_squared_tail(1, statistic)
-        if p < min(worst, P_LEAST):
+        if p != p:
+            p, detail = 0.0, f"what the data say of the fixed {name} cannot be told. Check it, or free it"
+        elif p < min(worst, P_LEAST):
             detail = (
                 f"the data contradict the fixed {name} = {value:.4g} {units[name]}; a "
                 f"{'larger' if step[-1] > 0 else 'smaller'} value fits better ({p_text(p)}). Check it, or free it"
