@@ -13,6 +13,7 @@ from ambid.estimation.estimate import estimate_to_json
 from ambid.job import identify, track
 from ambid.physics.presets import preset
 from ambid.record import Record, write_record
+from ambid.recursive.lines import TrackedValue, TrackHeader
 from ambid.rig import default_rig
 from ambid.signals import multisine
 from ambid.simulation import simulate_preset, simulate_scenario, truth_columns
@@ -311,6 +312,49 @@ def test_what_the_start_failed_is_passed_on(steady):
     ]
     found = track(replace(steady[0], channels=tuple(coarse)), to_s=2.0)
     assert found.header.warnings
+
+
+def test_a_track_is_no_better_than_its_start(steady):
+    def judged(**more):
+        return track(steady[0], start=replace(start(2), **more), to_s=0.3)
+
+    assert judged().verdict.word == judged(extended=("slow_force",)).verdict.word == "usable"
+    for cause in ("cross_talk", "line (13 Hz)", "slow_force (15 Hz)", "r_drift (0.2 ohm)"):
+        (reason,) = judged(extended=("slow_force", cause)).verdict.reasons
+        assert (reason.check, reason.grave) == ("start", False)
+        assert f"extended by {cause}, which tracking leaves out" in reason.text
+        assert "Remove the cause" in reason.text
+    first_guess = judged(status="stalled").verdict
+    assert first_guess.word == "unusable"
+    assert first_guess.reasons[0].text.startswith("the start is unusable: the search did not converge")
+
+
+def test_values_have_what_the_rig_says_of_calibration(steady):
+    rig, brief = default_rig(), {"start": start(2), "to_s": 0.3}
+    known = {"voltage": 0.03, "current": 0.04}
+    channels = tuple(replace(c, gain_sd=known.get(c.role)) for c in rig.channels)
+    found = track(steady[0], replace(rig, channels=channels), **brief)
+    for name, share in {"R": 0.05, "k_i": 0.03, "k_x": 0.05}.items():  # V/A, V, V A
+        p = found[name]
+        assert p.sd_calibrated == pytest.approx(np.hypot(p.sd, share * p.value), rel=1e-6)
+        assert p.ci95_calibrated[1] - p.value == pytest.approx(1.96 * p.sd_calibrated, rel=1e-4)
+    text = " ".join(found.summary().split())
+    assert "with calibration" in text
+    assert "Some of the calibration is in no interval. 1 % of gain moves: position" in text
+    assert found.to_dataframe()["R sd_calibrated"].iloc[-1] == found["R"].sd_calibrated
+    untold = track(steady[0], **brief)
+    assert (untold["R"].sd_calibrated, untold["R"].ci95_calibrated) == (None, None)
+    assert "Intervals are from this record alone. 1 % of gain moves: voltage" in " ".join(untold.summary().split())
+
+
+def test_a_number_that_the_start_did_not_show_is_no_measure_of_its_error_of_scale():
+    header = TrackHeader(
+        rate_hz=1e3, limit=1.5, method="rpem", model="one-axis", units={}, every_s=0.1, scale_sd={"R": 0.3, "c": 0.3},
+        start={"R": TrackedValue(value=2.0, sd=0.1), "c": TrackedValue(value=0.1, sd=1.0)},
+    )  # fmt: skip
+    assert header.sd_calibrated("R", TrackedValue(value=10.0, sd=4.0)) == pytest.approx(5.0)
+    assert header.sd_calibrated("c", TrackedValue(value=10.0, sd=0.04)) == pytest.approx(0.05)
+    assert header.sd_calibrated("L", TrackedValue(value=10.0, sd=4.0)) is None
 
 
 def test_an_incredible_value_is_rejected_not_learned(steady):

@@ -239,13 +239,17 @@ def test_the_header_names_units_and_start():
 
 
 def test_warnings_of_the_start_come_back_and_a_header_without_them_is_read(tmp_path):
-    head = replace(track_of(seconds=1.0).header, warnings=("the residuals are not white",))
+    head = replace(
+        track_of(seconds=1.0).header, warnings=("the residuals are not white",), grave=("it is no estimate",),
+        notes=("1 % of gain moves: voltage R +1 %",), scale_sd={"R": 0.01},
+    )  # fmt: skip
     document = header_json(head)
     (tmp_path / "t.jsonl").write_text(json.dumps(document) + "\n", encoding="utf-8")
     assert read_track(tmp_path / "t.jsonl").header == head
-    del document["warnings"]
+    for name in ("warnings", "grave", "notes", "scale_sd"):
+        del document[name]
     (tmp_path / "t.jsonl").write_text(json.dumps(document) + "\n", encoding="utf-8")
-    assert read_track(tmp_path / "t.jsonl").header.warnings == ()
+    assert read_track(tmp_path / "t.jsonl").header == track_of(seconds=1.0).header
 
 
 def noticed(*times, kind="disturbed", **values):

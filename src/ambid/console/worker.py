@@ -495,7 +495,7 @@ class _Lines:
         self._worker.feed.tell(
             "header",
             {"model": header.model, "method": header.method, "limit": header.limit, "units": dict(header.units),
-             "start": start, "warnings": list(header.warnings), "meanings": meanings(header.model)},
+             "start": start, "warnings": [*header.grave, *header.warnings], "meanings": meanings(header.model)},
             sticky="header",
         )  # fmt: skip
         self._worker.feed.keep("told", lambda: {"events": [_told(e) for e in state.events]})

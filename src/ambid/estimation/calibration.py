@@ -23,7 +23,7 @@ from ambid.arrays import Array
 from ambid.estimation.estimate import EstimatedParameter, Parametric
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.predictor import assemble
-from ambid.estimation.result import NORMAL_95
+from ambid.estimation.result import interval_95
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import Lines, SensorError, error_moves
@@ -187,7 +187,7 @@ def _sources(rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, floa
 
 def _widened(p: EstimatedParameter, spread: float) -> EstimatedParameter:
     sd = float(np.hypot(p.sd, spread))
-    return replace(p, sd_calibrated=sd, ci95_calibrated=(p.value - NORMAL_95 * sd, p.value + NORMAL_95 * sd))
+    return replace(p, sd_calibrated=sd, ci95_calibrated=interval_95(p.value, sd))
 
 
 def lines_of(fit: Fit) -> Lines:

@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 NORMAL_95 = 1.959963984540054  # sd on either side of the mean that hold 95 % of a normal distribution
 
 
+def interval_95(value: float, sd: float) -> tuple[float, float]:
+    """Return the interval that holds 95 % of a normal distribution."""
+    return value - NORMAL_95 * sd, value + NORMAL_95 * sd
+
+
 def _shown(name: str) -> Any:
     """Return a function that shows results."""
     return getattr(import_module("ambid.job.presentation"), name)

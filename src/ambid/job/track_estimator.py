@@ -32,7 +32,7 @@ from ambid.recursive import (
     RecursiveLeastSquares,
     RecursivePolynomial,
 )
-from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
+from ambid.recursive.lines import Event, StartWords, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig, default_rig
 from ambid.settings.caller import refuse_given, setting
 
@@ -58,7 +58,7 @@ class _Run:
     units: Mapping[str, str]
     origin: Mapping[str, object]
     start: Mapping[str, TrackedValue]
-    warnings: tuple[str, ...] = ()
+    said: StartWords  # of the start, or the method
 
 
 def track_estimator(
@@ -132,7 +132,7 @@ def _coefficients(
     return _Run(
         estimator=estimator, inputs=u, outputs=y, rate_hz=1 / data.dt, t0=t0, scale=np.array(scale), model=label,
         units=units, origin={name: data.record[name] for name in ("file", "sha256", "samples")}, start={},
-        warnings=_bias(method, data, estimator),
+        said={"warnings": _bias(method, data, estimator)},
     )  # fmt: skip
 
 
@@ -219,7 +219,7 @@ def _joint(
         outputs=np.column_stack([bench[x].values for x in plant.outputs])[first:],
         units={k: units.get(k) or offsets[k] for k in joint.names},
         origin={**source.origin, "samples": bench.n_samples - first},
-        start={k: TrackedValue(value=estimate.values[k], sd=sd[k]) for k in free}, warnings=begin.warnings,
+        start={k: TrackedValue(value=estimate.values[k], sd=sd[k]) for k in free}, said=begin.said,
     )  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def _follow(run: _Run, method: str, how: Following) -> Track:
     every = max(1, round(how.every_s * run.rate_hz))
     header = TrackHeader(
         rate_hz=run.rate_hz, limit=how.limit, method=method, model=run.model, units=run.units,
-        every_s=every / run.rate_hz, start=run.start, record=run.origin, warnings=run.warnings,
+        every_s=every / run.rate_hz, start=run.start, record=run.origin, **run.said,
     )  # fmt: skip
     parts = (slice(first, first + every) for first in range(0, run.outputs.shape[0], every))
     track = tell(header, (_line(run, part) for part in parts), how)

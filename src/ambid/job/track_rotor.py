@@ -25,10 +25,10 @@ from ambid.job.closed_loop import controller_of, loop_and_peaks, measure, refuse
 from ambid.job.data import Reading, Source, load_bench, origin
 from ambid.job.following import Following, tell
 from ambid.job.rotor import identify_rotor
-from ambid.job.track_start import BenchRows
+from ambid.job.track_start import BenchRows, words_of_start
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
-from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
+from ambid.recursive.lines import Event, StartWords, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Experiment, Point, noise_weight
@@ -83,7 +83,7 @@ def track_rotor(
     with one_thread():
         follower, size = _filter(estimate, rig, bench, whole, n, how), _size(how, bench, excitation.period)
         samples = (excitation.count - first) * excitation.period
-        header = _header(follower, bench, excitation, size, samples, how, estimate if start is None else None)
+        header = _header(follower, bench, excitation, size, samples, how, words_of_start(estimate, rig))
         say("track")
         blocks = (
             _block(whole, spectra.U[k : k + size], spectra.Y[k : k + size], excitation.first + k * excitation.period)
@@ -144,7 +144,7 @@ def follow_rotor(
                 on_lag(time.perf_counter() - arrived_s)
                 judge.take(U, Y, at + size * period)
 
-        header = _header(follower, bench, excitation, size, None, how, estimate if identified else None)
+        header = _header(follower, bench, excitation, size, None, how, words_of_start(estimate, rig))
         return tell(header, lines(), how)
 
 
@@ -273,14 +273,15 @@ def _block(whole: Experiment, U: Complex, Y: Complex, at: int) -> Block:
 
 def _header(
     follower: RotorFilter, bench: Record, excitation: Excitation, size: int, samples: int | None, how: Following,
-    identified: RotorEstimate | None,
+    said: StartWords,
 ) -> TrackHeader:  # fmt: skip
-    """Return the header of a track; `identified`: the start, where it was made from the record."""
+    """Return the header of a track; `said`: of the start."""
+    start, moved = _values(follower, stale=False), {_shown(n)[0]: x for n, x in said["scale_sd"].items()}
+    said = {**said, "scale_sd": {name: x for name, x in moved.items() if name in start}}
     return TrackHeader(
         rate_hz=bench.rate_hz, limit=how.limit, method=f"periods, memory {how.memory}", model="rotor",
         every_s=size * excitation.period / bench.rate_hz, units=_units(follower),
-        start=_values(follower, stale=False), record={**origin(bench), "samples": samples},
-        warnings=() if identified is None else tuple(r.text for r in identified.verdict.reasons),
+        start=start, record={**origin(bench), "samples": samples}, **said,
     )  # fmt: skip
 
 

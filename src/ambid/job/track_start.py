@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
@@ -18,8 +18,11 @@ from ambid.job.identification import identify_axis
 from ambid.job.results import load_result
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
+from ambid.recursive.lines import StartWords
+from ambid.report.parameters import calibration_lines
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
+from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import command, saved, setting
 from ambid.tracking.blocks import Replay, blocks_of
 from ambid.tracking.guard import ABSURD
@@ -34,6 +37,7 @@ _LEAST = 1e-9  # part of an output that is not predicted
 _SAME = 1e-6  # relative difference of values that were written and read
 _FAR = 4.0  # standard deviations between a prior and a start that contradicts it
 _BLOCK_S = 0.01  # of the stream
+_HELD = ("slow_force", "slow_voltage")  # walks that extend an estimate, and the tracker's own offsets hold
 _ROWS = (".csv", ".csv.gz", ".h5", ".hdf5")  # formats whose rows are read with their damage
 
 
@@ -157,7 +161,7 @@ class Start:
     estimate: Estimate
     numbers: TrackedNumbers
     first: int  # number of the first sample that is tracked
-    warnings: tuple[str, ...]  # what to mistrust, one line each
+    said: StartWords  # of the estimate
 
 
 def start_of(
@@ -184,13 +188,34 @@ def start_of(
                 f"the start estimate is incomplete ({type(error).__name__}: {error}). Write it again with "
                 f"'{command('identify', json=True)}'"
             ) from error
-    failed = [c.detail for c in estimate.checks.values() if not c.passed and c.detail not in estimate.warnings]
-    return Start(
-        estimate=estimate,
-        numbers=numbers,
-        first=first,
-        warnings=(*warnings, *estimate.warnings, *failed, *numbers.warnings),
-    )
+    said = words_of_start(estimate, rig, [*warnings, *estimate.warnings], numbers.warnings)
+    return Start(estimate=estimate, numbers=numbers, first=first, said=said)
+
+
+def words_of_start(
+    estimate: Estimate | RotorEstimate, rig: Rig, first: Sequence[str] = (), last: Sequence[str] = ()
+) -> StartWords:
+    """Return what a track says of its start: what stands against it, which a track inherits, with warnings `first` and
+    `last`, and what calibration does to it.
+    """
+    grave = {r.text: None for r in estimate.reasons if r.grave}
+    warnings = dict.fromkeys([*first, *(r.text for r in estimate.reasons), *last])
+    lacking = [cause for cause in getattr(estimate, "extended", ()) if cause not in _HELD]
+    if lacking:
+        text = f"the start's model was extended by {', '.join(lacking)}, which tracking leaves out: it may move the"
+        warnings[f"{text} values by more than they are wide. Remove the cause, or identify part by part"] = None
+    stated = {**{c.role: c.gain_sd for c in rig.channels}, "rate": rig.record.rate_sd}
+    known = {**estimate.calibration_sd, **{source: sd for source, sd in stated.items() if sd is not None}}
+    scale_sd = dict[str, float]()
+    for source, moves in estimate.calibration.items():
+        for name, x in moves.items() if source in known else ():
+            scale_sd[name] = math.hypot(scale_sd.get(name, 0.0), x * known[source])
+    return {
+        "warnings": tuple(text for text in warnings if text not in grave),
+        "grave": tuple(f"the start is unusable: {text}" for text in grave),
+        "notes": tuple(calibration_lines(replace(estimate, calibration_sd=known))),
+        "scale_sd": scale_sd,
+    }
 
 
 def check_settling(rpem: PhysicalRpem, duration_s: float, first: int) -> None:

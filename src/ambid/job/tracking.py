@@ -184,7 +184,7 @@ def follow(
     samples = None if live else int(np.count_nonzero(source.replay.numbers >= first))
     top = header(
         supervisor, limit=how.limit, every_s=reporter.every_s, method=f"rpem, memory {how.memory}",
-        record={**source.origin, "samples": samples}, warnings=begin.warnings,
+        record={**source.origin, "samples": samples}, said=begin.said,
     )  # fmt: skip
     tally = Tally(top)
     if how.on_header is not None:

@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, TypedDict
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, choices
-from ambid.estimation.result import NORMAL_95, Reason, Result
+from ambid.estimation.result import Reason, Result, interval_95
 from ambid.physics.linear_model import model_names
 from ambid.settings.caller import setting
 
@@ -71,6 +71,15 @@ class Event:
     values: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
 
+class StartWords(TypedDict, total=False):
+    """What the header of a track says of its start, as its fields."""
+
+    warnings: tuple[str, ...]
+    grave: tuple[str, ...]
+    notes: tuple[str, ...]
+    scale_sd: Mapping[str, float]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackHeader:
     """First line of a track."""
@@ -86,6 +95,18 @@ class TrackHeader:
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     # what to mistrust of the start, one line each: checks that failed, parameters hardly known
     warnings: tuple[str, ...] = ()
+    grave: tuple[str, ...] = ()  # and why nothing that begins with it is to be used
+    notes: tuple[str, ...] = ()  # what is in no interval, one line each
+    # relative standard deviation that what the rig says of calibration adds to each parameter
+    scale_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    def sd_calibrated(self, name: str, v: TrackedValue) -> float | None:
+        """Return the standard deviation of a value with calibration, None where the rig says nothing of it."""
+        if name not in self.scale_sd or not math.isfinite(v.sd):
+            return None
+        start = self.start.get(name, v)
+        at = start if is_vague(start) else v  # a number that the start did not show is no measure of its error
+        return math.hypot(v.sd, self.scale_sd[name] * at.value)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,6 +190,8 @@ class ParameterTrack:
     value: float
     sd: float
     ci95: tuple[float, float]
+    sd_calibrated: float | None  # with what the rig says of calibration; None where it says nothing
+    ci95_calibrated: tuple[float, float] | None
     t: Array  # (n_lines,), end of each reporting interval, s of record
     values: Array  # (n_lines,)
     sds: Array  # (n_lines,)
@@ -225,6 +248,7 @@ class Track(Result):
         if vague:
             text = f"not identifiable: {', '.join(vague)} (sd above {_VAGUE:.0%} of the value). Excite more"
             found.append(Reason(check="identifiable", text=text))
+        found += [Reason(check="start", text=text, grave=True) for text in header.grave]
         return (*found, *(Reason(check="start", text=text) for text in header.warnings))
 
     def __getitem__(self, name: str) -> ParameterTrack:
@@ -233,8 +257,10 @@ class Track(Result):
             raise EstimationError(f"the track has no parameter {name!r}; it has {choices(name, names)} Check the name")
         kept = [(x.t, {**x.parameters, **x.extra}.get(name, _UNKNOWN)) for x in self.lines]
         last = kept[-1][1]
+        sd = self.header.sd_calibrated(name, last)
         return ParameterTrack(
             name=name, unit=self.header.units.get(name, ""), value=last.value, sd=last.sd,
-            ci95=(last.value - NORMAL_95 * last.sd, last.value + NORMAL_95 * last.sd), t=np.array([t for t, _ in kept]),
+            ci95=interval_95(last.value, last.sd), sd_calibrated=sd,
+            ci95_calibrated=None if sd is None else interval_95(last.value, sd), t=np.array([t for t, _ in kept]),
             values=np.array([v.value for _, v in kept]), sds=np.array([v.sd for _, v in kept]),
         )  # fmt: skip

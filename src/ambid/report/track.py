@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ambid.errors import counted
 from ambid.estimation.estimate import EstimatedParameter
-from ambid.estimation.result import NORMAL_95, Verdict
+from ambid.estimation.result import Verdict, interval_95
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.document import Column, Document, Frame, Lines, Part, Section, Table, grid
 from ambid.report.numbers import quantity, sized
@@ -47,6 +47,9 @@ def track_document(
         columns: dict[str, Any] = {"t": history.t, "state": [x.state for x in track.lines], "error": history.error}
         for name in history.names:
             columns |= dict(zip((name, f"{name} sd"), history.values(name)[:2], strict=True))
+            if name in track.header.scale_sd:
+                values = (x.parameters[name] for x in track.lines)
+                columns[f"{name} sd_calibrated"] = [track.header.sd_calibrated(name, v) for v in values]
         return "t", columns
 
     name = str(track.header.record.get("file") or "record")
@@ -76,7 +79,10 @@ def track_sections(track: Track, events: Sequence[Event] = ()) -> list[Section]:
     extra = [(name, value_words(v, header.units.get(name, ""))[0]) for name, v in last.extra.items()]
     return [
         head,
-        Section(title="Parameters", parts=[track_table(header, last, track.verdict)]),
+        Section(
+            title="Parameters",
+            parts=[track_table(header, last, track.verdict), Lines(lines=list(header.notes), indent=2)],
+        ),
         Section(parts=[grid([("", ""), *extra], bare=True)] if extra else []),
         Section(parts=[Lines(lines=[state], wrap=False)]),
         Section(title="Events", parts=event_parts(events or totals.changes)),
@@ -114,9 +120,11 @@ def track_table(header: TrackHeader, last: TrackLine, verdict: Verdict) -> Table
     """Return the parameters at the end of a track; `verdict`: on all of them."""
     rows = []
     for name, v in last.parameters.items():
+        sd = header.sd_calibrated(name, v)
         p = EstimatedParameter(
             name=name, unit=header.units.get(name, ""), value=v.value, sd=v.sd, role="free", identifiable=not v.stale,
-            ci95=(v.value - NORMAL_95 * v.sd, v.value + NORMAL_95 * v.sd),
+            ci95=interval_95(v.value, v.sd), sd_calibrated=sd,
+            ci95_calibrated=None if sd is None else interval_95(v.value, sd),
         )  # fmt: skip
         rows.append(TrackedRow(parameter=p, verdict=verdict, tracked=v, start=header.start.get(name)))
     change = Column(label="from start", cell=lambda row: change_words(row.tracked, row.start), right=True)
@@ -132,7 +140,7 @@ def value_words(v: TrackedValue, unit: str) -> tuple[str, str]:
         return "unknown", ""
     if not math.isfinite(v.sd):
         return f"{sized(v.value, unit, 5)} ± ?", ""
-    q = quantity(v.value, v.sd, unit, ci95=(v.value - NORMAL_95 * v.sd, v.value + NORMAL_95 * v.sd))
+    q = quantity(v.value, v.sd, unit, ci95=interval_95(v.value, v.sd))
     return q.text, f"{q.low} … {q.high}" if q.low else ""
 
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import Event, StartWords, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.tracking.evidence import Samples
 from ambid.tracking.supervisor import Supervisor
 
@@ -159,11 +159,9 @@ def header(
     every_s: float,
     method: str,
     record: Mapping[str, object],
-    warnings: Sequence[str] = (),
+    said: StartWords | None = None,
 ) -> TrackHeader:
-    """Return the first line of a track by a supervisor before its first sample; `warnings`: what to mistrust of the
-    start.
-    """
+    """Return the first line of a track by a supervisor before its first sample; `said`: of the start."""
     numbers = supervisor.rpem.numbers
     start: dict[str, TrackedValue] = supervisor.parameters
     gains = [name for name, kind in zip(numbers.names, numbers.kinds, strict=True) if kind == "gain"]
@@ -177,5 +175,5 @@ def header(
         every_s=every_s,
         start=start,
         record=record,
-        warnings=tuple(warnings),
+        **(said or {}),
     )

@@ -281,7 +281,7 @@ def _with_causes(
 def told(fit: Fit, taken: Sequence[Cause]) -> tuple[str, ...]:
     """Return what a fit is extended by: causes `taken`, with their sizes, and coloured noise."""
     noise = [
-        f"slow_{c.source}" if c.damping is None else f"coloured_{c.source} ({c.frequency_hz:.3g} Hz)"
+        f"{'slow' if c.damping is None else 'coloured'}_{c.source} ({c.frequency_hz:.3g} Hz)"
         for c in colours_of(fit.problem)
     ]
     return tuple(dict.fromkeys([*map(_told, taken), *noise]))
