@@ -97,3 +97,18 @@ def test_what_cannot_be_tracked_is_refused(jump: tuple[Any, Any, Record]) -> Non
     for words, said in refused:
         with pytest.raises(AmbidError, match=said):
             ambid.track(**words)
+
+
+def test_a_track_inherits_what_stands_against_its_start_and_its_calibration(jump: tuple[Any, Any, Record]) -> None:
+    record, rig = jump[2], free_rig(jump[0])
+    head = ambid.identify(record[: 4 * _PERIOD_S], rig)
+    known = replace(
+        rig, channels=tuple(replace(c, gain_sd=0.02 if c.role == "ax_voltage" else None) for c in rig.channels)
+    )
+    found = ambid.track(record, known, start=replace(head, status="stalled"))
+    assert found.verdict.word == "unusable"
+    assert found.verdict.reasons[0].text.startswith("the start is unusable: the search did not converge")
+    R, other = found["ax.R"], found["bx.R"]
+    assert R.sd < 0.01 * R.value  # so that calibration is most of it; other numbers take up a little
+    assert R.sd_calibrated == pytest.approx(np.hypot(R.sd, 0.02 * R.value), rel=0.01)
+    assert other.sd_calibrated == pytest.approx(other.sd, rel=0.01)
