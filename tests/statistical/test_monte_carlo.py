@@ -125,3 +125,12 @@ def test_a_short_record_is_not_overconfident():
     assert np.all(inside >= n.limit(0.88)), named(inside)
     ratio = np.median(sds, axis=0) / estimates.std(axis=0, ddof=1)
     assert np.all((ratio > n.limit(0.8, centre=1)) & (ratio < 2.0)), named(ratio)
+
+
+@pytest.mark.parametrize("seed", [12, 13])
+def test_a_record_shorter_than_the_noise_needs_is_not_explained_by_a_walk(seed):
+    estimate = ambid.identify(
+        ambid.simulate("levitated-ball", duration=0.15, seed=seed), rig_of_preset(preset("levitated-ball"))
+    )
+    assert not estimate.extended
+    assert not estimate.checks["long_enough"].passed

@@ -275,7 +275,7 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
     taken: tuple[Cause, ...] = ()
     for _ in range(_CAUSES):
         named, fixed = estimate.checks.get("causes"), estimate.checks["fixed_agree"].p
-        if named is None or named.passed:
+        if named is None or named.passed or not estimate.checks["long_enough"].passed:  # a walk is all that shows then
             break
         prior = chi_squared_tail(1, estimate.checks["priors_agree"].values["largest_sd"] ** 2)
         doubtful = min(prior, 1.0 if fixed is None else fixed) < P_LEAST
