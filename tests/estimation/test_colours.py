@@ -75,10 +75,13 @@ FAST = (
 )
 
 
-@pytest.mark.parametrize(("colours", "kept", "shape"), [(SLOW, 0, _SHAPE[:1]), (SLOW + FAST, 2, _SHAPE)])
-def test_slopes_of_the_matrices_are_exact(colours, kept, shape):
-    """By every parameter of the model, and by frequency and damping of the last colours."""
-    wide = _Shaped(plain=model("one-axis"), colours=colours, kept=kept)
+@pytest.mark.parametrize(
+    ("colours", "which", "shape"),
+    [(SLOW, (0, 1), _SHAPE[:1]), (SLOW + FAST, (2, 3, 4), _SHAPE), (FAST + SLOW, (1,), _SHAPE)],
+)
+def test_slopes_of_the_matrices_are_exact(colours, which, shape):
+    """By every parameter of the model, and by frequency and damping of some colours."""
+    wide = _Shaped(plain=model("one-axis"), colours=colours, which=which)
     theta = {**BEARING, "c": 3.0, **dict(zip(shape, (0.3, -0.2), strict=False))}
     for name, value in theta.items():
         step = 1e-5 * max(abs(value), 1.0 if name in _SHAPE else 0.0)

@@ -225,9 +225,11 @@ def _with_drift(
     where it is not, the fit says by how much it is `beaten`.
     """
     more, law = _drifting(fit, short, white, tick), fit.problem.law
+    if law.pair:  # its gap has one law
+        return more
     other = replace(law, gap="hyperbolic" if law.gap == "exponential" else "exponential")
     open_to_it = other.gap in {x.gap for x in laws}
-    if law.pair or fit.status == "failed" or (more is fit and open_to_it):
+    if fit.status == "failed" or (more is fit and open_to_it):
         return more
     fresh, price = start_numbers(other, parameters, short, linear), float(np.log(fit.problem.n_used))
     rivals = list[BearingFit]()

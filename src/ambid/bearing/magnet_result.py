@@ -186,7 +186,7 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
             if name in self.covariance_names:
                 gradient[:, :, self.covariance_names.index(name)] -= self._along(true_x, true_i, point)
         variance = np.einsum("ncj,jk,nck->nc", gradient, self.covariance, gradient)
-        size = np.array([self.values[name] or 1.0 for name in self.covariance_names])
+        size = np.array([self.values.get(name) or 1.0 for name in self.covariance_names])
         for source in self.calibration.keys() & self.calibration_sd.keys():
             moves = np.array([self.calibration[source][name] for name in self.covariance_names])
             variance += (self.calibration_sd[source] * gradient @ (size * moves)) ** 2

@@ -383,11 +383,12 @@ def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
 
     check = check_units(fit.problem.parameters(fit.vector), rig.parameters, signals, fit.problem.model)
     constrained = [p for p in rig.parameters if p.role != "free" and p.value]
-    if not constrained or fit.problem.extra is not None or not (doubt or check.values["unusual"]):
+    doubt = doubt and fit.problem.extra is None
+    if not constrained or not (doubt or check.values["unusual"]):
         return check
     free = [replace(p, role="free", value=None, sd=None) if p in constrained else p for p in rig.parameters]
     with contextlib.suppress(EstimationError, np.linalg.LinAlgError):
-        alone = greybox(fit.problem.model, signals, free, delay=fit.problem.delay, evaluations=0)
+        alone = greybox(rig.plant, signals, free, delay=fit.problem.delay, evaluations=0)
         again = check_units(alone.problem.parameters(alone.vector), rig.parameters, signals, fit.problem.model)
         if alone.status == "converged" and not again.passed:
             return again

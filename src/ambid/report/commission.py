@@ -275,13 +275,17 @@ def measured_picture(loops: Mapping[str, Margins]) -> Picture:
 _NONE: Array = np.empty(0)
 
 
-def _trace(axes: Axes, role: str, values: Array, rate_hz: float, ends: Sequence[float]) -> None:
+def _trace(
+    axes: Axes, role: str, values: Array, rate_hz: float, ends: Sequence[float], shaded_s: float | None = None
+) -> None:
     """Draw a quantity over time, within its trips."""
     scale, unit = prefixed(float(np.max(np.abs(values), initial=0.0)), UNITS[role])
     curve(axes, np.arange(values.size) / rate_hz, values / scale, MEASURED, None)
     for end in ends:
         if math.isfinite(end):
             axes.axhline(end / scale, color=BOUND, linestyle="--", linewidth=1.0)
+    if shaded_s is not None:
+        axes.axvspan(0.0, shaded_s, color="#eeeeee", zorder=0)
     axes.set_ylabel(f"{role} [{unit}]")
     axes.set_xlabel("time [s]")
     axes.margins(x=0.0)
