@@ -71,6 +71,7 @@ _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
 _TURNS = 8  # in which sizes and parameters are found in turn
+_NEAR = 1.5  # ratio of frequencies within which colours are of one shape
 _SETTLED = 0.1  # gain below which they are
 
 
@@ -231,11 +232,18 @@ def extended(
         more = _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
     if more is not None:
         return _resettled(more[0], means, plain, more[1])
+    had = colours_of(fit.problem)
     noises = [[c.colour] for c in found if c.colour and (c in strong or c.channel == cause.channel)]
+    noises = [c for c in noises if not any(_same(c[0], h) for h in had)]
     louder = coloured(fit, noises) if noises else None
     if louder is None:
         return None
     return _resettled(louder, means, plain, taken)
+
+
+def _same(a: Colour, b: Colour) -> bool:
+    """Whether colours are of one source and about one frequency: what still stands there is no noise of that shape."""
+    return a.source == b.source and a.order == b.order and abs(np.log(a.omega / b.omega)) < np.log(_NEAR)
 
 
 def _resettled(
