@@ -295,7 +295,7 @@ def estimate_of(
     before, in the model's order; `robust`: the larger of information and robust deviations; `means`: operating point
     taken off, by role, SI; `one_step`, `simulation` (n_outputs,): fits, the latter None where the plant is unstable.
     """
-    problem = fit.problem
+    problem, plain = fit.problem, without_colours(fit)
     theta = problem.parameters(fit.vector)
     sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
     settled = fit.status == "converged"  # of a search that has not ended nothing is certain
@@ -311,8 +311,8 @@ def estimate_of(
         covariance=known.covariance(robust=robust),
         covariance_method="robust" if robust else "information",
         delay=dict.fromkeys(problem.model.inputs, delay),
-        continuous=Continuous.of(problem.model, theta),
-        noise=_noise(without_colours(fit)),
+        continuous=Continuous.of(plain.problem.model, theta),
+        noise=_noise(plain),
         operating_point=means,
         fit={
             role: OutputFit(
