@@ -186,10 +186,9 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
             if name in self.covariance_names:
                 gradient[:, :, self.covariance_names.index(name)] -= self._along(true_x, true_i, point)
         variance = np.einsum("ncj,jk,nck->nc", gradient, self.covariance, gradient)
-        size = np.array([self.values.get(name) or 1.0 for name in self.covariance_names])
         for source in self.calibration.keys() & self.calibration_sd.keys():
-            moves = np.array([self.calibration[source][name] for name in self.covariance_names])
-            variance += (self.calibration_sd[source] * gradient @ (size * moves)) ** 2
+            moves = [self.calibration[source][name] * (self.values[name] or 1.0) for name in self.covariance_names]
+            variance += (self.calibration_sd[source] * gradient @ np.array(moves)) ** 2
         sd = np.sqrt(np.maximum(variance, 0.0))
         force, k_x, k_i, ell = (
             Curve(unit=unit, value=table[:, c], sd=sd[:, c]) for c, unit in enumerate(("N", "N/m", "N/A", "H"))

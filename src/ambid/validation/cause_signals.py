@@ -65,7 +65,7 @@ def _groups_of(s: Course, mode: float, *, thorough: bool) -> Groups:
     step = np.append(0.0, s.u_before - s.u)
     yield "amplifier_lag", tuple((("voltage", np.append(np.zeros(k), step[1:-k])),) for k in (1, 2))
     for channel in ("force", "voltage", "current"):
-        yield f"slow_{channel}", tuple(((channel, wave),) for wave in half_waves(s.t, WAVES))
+        yield f"slow_{channel}", tuple(((channel, wave),) for wave in _half_waves(s.t))
     for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
         yield "curvature", tuple(_curvature(s, degree))
     if not thorough:
@@ -84,11 +84,11 @@ def _ends(signal: Array) -> tuple[Array, Array]:
     return np.maximum(signal - high, 0.0), np.minimum(signal - low, 0.0)
 
 
-def half_waves(t: Array, count: int) -> list[Array]:
-    """Return t, t² and half waves over the record, 3 to `count` of them, slow ones first: waves have no slope at the
+def _half_waves(t: Array) -> list[Array]:
+    """Return t, t² and half waves over the record, 3 to `WAVES` of them, slow ones first: waves have no slope at the
     ends, so that those of a walk fall with their number's fourth power only beside the two others.
     """
-    return [t, t * t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(3, count + 1))]
+    return [t, t * t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(3, WAVES + 1))]
 
 
 def _curvature(s: Course, degree: int) -> Iterator[Column]:
