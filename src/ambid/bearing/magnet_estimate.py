@@ -56,7 +56,7 @@ def estimate_bearing(
     *,
     laws: Sequence[MagnetLaw],
     delay: float | None = None,
-    extend: Sequence[str] = (*PARTS, "drift"),
+    extend: Sequence[str] = (*PARTS, "drift", "zeros"),
     white: Callable[[BearingFit], bool] | None = None,
     eddy: bool = False,
     drift: bool = False,
@@ -65,11 +65,11 @@ def estimate_bearing(
     seed: int = 0,
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several `records`, at least one of a free rotor. `laws`: the likelihood
-    chooses; `extend`: parts that they may take on (BIC), saturation and drift only with residuals that are `white`, or
-    they would take up any misfit; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force
-    behind a pole a/(s + a); `drift`: a force that is forgotten in `tau` and a voltage that walks, both driven by noise,
-    for sure, not only where they pay; `seed`: of the global search, told by the fit's `global_search`; a
-    KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
+    chooses; `extend`: parts that they may take on (BIC), saturation, drift and zeros of each record's own only with
+    residuals that are `white`, or they would take up any misfit; `delay`: of the voltage in samples of the first
+    record, None: found; `eddy`: force behind a pole a/(s + a); `drift`: a force that is forgotten in tau and a voltage
+    that walks, both driven by noise, for sure, not only where they pay; `seed`: of the global search, told by the fit's
+    `global_search`; a KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
     """
     free = [r for r in records if not r.held]
     if not free:
@@ -80,6 +80,7 @@ def estimate_bearing(
     shown_soon = [n for n in ("asymmetric", "rise") if n in extend and (laws[0].pair or n != "asymmetric")]
     again = _remembered(tick)
     longer = tuple(r.first(_LONGER) for r in records)
+    every = short, longer, records
     some = float(sum(r.u.size for r in longer)) * (max(r.u.size for r in records) > 2 * _LONGER)
     ticks = portions(again, [*[few] * len(laws), 2.0 * few * bool(shown_soon), some, many, many * (delay is None)])
     with one_thread():
@@ -88,26 +89,38 @@ def estimate_bearing(
             _first(short, parameters, law, linear, delay, eddy=eddy, drift=drift, tick=t)
             for law, t in zip(laws, ticks, strict=False)
         ]
-        fit = min(fits, key=lambda f: f.criterion)
-        for part in shown_soon:
-            fit = _extended(fit, part, parameters, short, linear, ticks[-4])
-        whole, near = replace(fit.problem, records=tuple(records)), _FAR
-        if some:  # a step or two over all samples will do from there
-            fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
-            near = _CLOSE if fit.status == "converged" else _FAR
-        fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
-        if "saturation" in extend:
-            richer = _extended(fit, "saturation", parameters, short, linear, again)
-            same = richer.problem.law == fit.problem.law
-            sure = not same and richer.status != "failed" and _saturates(richer)
-            fit = richer if same or (sure and (white is None or white(richer))) else fit
-        fit = rescue(
-            fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
-            lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
-            search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
-        )  # fmt: skip
-        if white is not None and "drift" in extend:
-            fit = _with_drift(fit, laws, parameters, short, linear, white, again)
+
+        def finished(fits: Sequence[BearingFit], ticks: Sequence[Tick | None]) -> BearingFit:
+            fit = min(fits, key=_bic)
+            short, longer, records = (_with_zeros_of(fit, x) for x in every)
+            for part in shown_soon:
+                fit = _extended(fit, part, parameters, short, linear, ticks[-4])
+            whole, near = replace(fit.problem, records=records), _FAR
+            if some:  # a step or two over all samples will do from there
+                fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
+                near = _CLOSE if fit.status == "converged" else _FAR
+            fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
+            if "saturation" in extend:
+                richer = _extended(fit, "saturation", parameters, short, linear, again)
+                same = richer.problem.law == fit.problem.law
+                sure = not same and richer.status != "failed" and _saturates(richer)
+                fit = richer if same or (sure and (white is None or white(richer))) else fit
+            fit = rescue(
+                fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
+                lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
+                search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
+            )  # fmt: skip
+            if white is not None and "drift" in extend:
+                fit = _with_drift(fit, laws, parameters, short, linear, white, again)
+            return fit
+
+        fit = None
+        if white is not None and "zeros" in extend:
+            own = [_own_zeros(f, again) for f in fits]
+            if _hopeful(min(own, key=_bic), fits, white, again):
+                fit = finished(own, [again] * len(ticks))
+        if fit is None or fit.status == "failed" or white is None or not white(fit):
+            fit = finished(fits, ticks)
     if fit.status == "failed":
         raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
     return fit
@@ -268,6 +281,55 @@ def _drifting(
     more = search(problem, begun, iterations=_LONG, tick=tick)
     pays = more.status == "converged" and fit.criterion - more.criterion > price
     return more if pays and np.all(more.vector < problem.upper() - _AT) and white(more) else fit
+
+
+def _bic(fit: BearingFit) -> float:
+    """The criterion with the price of the vector."""
+    return fit.criterion + fit.problem.size * float(np.log(fit.problem.n_used))
+
+
+def _own_zeros(fit: BearingFit, tick: Tick | None) -> BearingFit:
+    """Return a fit in which moving records but the first have a zero of the position of their own, taken out of them,
+    where that pays (BIC); the fit itself where it does not.
+    """
+    records = fit.problem.records
+    others = [r for r, x in enumerate(records) if not x.held][1:]
+    if not others or fit.status == "failed":
+        return fit
+    problem = replace(
+        fit.problem, records=tuple(replace(x, zero=0.0) if r in others else x for r, x in enumerate(records))
+    )
+    begun = _carried(fit, problem)
+    at = linearise(problem, begun)
+    if at is not None and promise(at) < _LIKELY * len(others) * float(np.log(problem.n_used)):
+        return fit
+    more = search(problem, begun, iterations=_LONG, tick=tick)
+    if more.status == "failed" or _bic(more) >= _bic(fit):
+        return fit
+    left = more.vector[problem.noise_slices[-1].stop :] * problem.zero_scale
+    taken = list(records)
+    for r, zero in zip(others, left.tolist(), strict=True):
+        taken[r] = _less(records[r], zero)
+    problem = replace(problem, records=tuple(taken))
+    return search(problem, _carried(more, problem), iterations=_SHORT, tick=tick)
+
+
+def _hopeful(
+    own: BearingFit, fits: Sequence[BearingFit], white: Callable[[BearingFit], bool], tick: Tick | None
+) -> bool:
+    """Whether zeros of their own may make residuals of short records white, with a drift if need be."""
+    if own in fits or own.status == "failed":
+        return False
+    return white(own) or _drifting(own, own.problem.records, white, tick) is not own
+
+
+def _less(record: BearingRecord, zero: float) -> BearingRecord:
+    return replace(record, zero=zero, y=record.y - [zero, 0.0])
+
+
+def _with_zeros_of(fit: BearingFit, records: Sequence[BearingRecord]) -> tuple[BearingRecord, ...]:
+    """Return the records less the zeros that a fit has taken out of theirs."""
+    return tuple(x if y.zero is None else _less(x, y.zero) for x, y in zip(records, fit.problem.records, strict=True))
 
 
 def _saturates(fit: BearingFit) -> bool:

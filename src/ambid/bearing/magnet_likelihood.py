@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.bearing.magnet_problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
+from ambid.bearing.magnet_problem import BODY, EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick
 from ambid.estimation.search import PhysicalFit
@@ -100,7 +100,10 @@ def sweep(
     if not possible or abs(theta[problem.law.names.index("k_asym")]) >= 1.0:
         yield None
         return
-    noise2, flags = problem.noise2(vector, r), problem.flags(r)
+    noise2, flags, zero = problem.noise2(vector, r), problem.flags(r), problem.zero(r)
+    offset = len(problem.law.names) + BODY.index("x_offset")
+    if zero is not None:
+        theta[offset] += vector[zero] * problem.zero_scale
     lanes, chain, columns = list[int](), np.zeros(0), np.zeros(0, dtype=np.int64)
     if slopes:
         names, place, levels = [n.name for n in problem.numbers], problem.noise_slices[r], problem.levels(r)
@@ -114,6 +117,8 @@ def sweep(
             late = [first, first + 1] if whole > 0 else [first]
         lanes, columns = lanes + [LATE, EARLY][: len(late)], np.append(columns, late).astype(np.int64)
         chain = np.concatenate([problem.chain(vector), 2.0 * noise2[list(levels)], np.ones(len(late))])
+        if zero is not None:
+            lanes, columns, chain = [*lanes, offset], np.append(columns, zero), np.append(chain, problem.zero_scale)
     p = len(lanes)
     rows = np.zeros((4 * _BLOCK if slopes else 1, p + 1))
     steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
@@ -182,7 +187,7 @@ def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]
     # an offset that moves takes the state with it: the start must not hold it where the search began
     free, spread = {n.name for n in problem.estimated}, record.kept.std(axis=0)
     for name, place, c in (("x_offset", 0, 0), ("i_offset", 2, 1)):
-        if name in free and not (record.held and c == 0):
+        if (name in free or (record.zero is not None and c == 0)) and not (record.held and c == 0):
             P[place, place] += float(spread[c]) ** 2
     if flags[2]:  # the force behind the eddy pole starts at that of the weight
         z[3] = -begun["m"] * begun["g"]
@@ -435,7 +440,7 @@ def _size(problem: BearingProblem, error: SensorError) -> float:
     """Return what an error is small beside: one, a fixed number, or for an offset the spread of its channel."""
     if error.kind == "fixed":
         return abs(next(n.value for n in problem.numbers if n.name == error.channel))
-    if error.kind == "gain":
+    if error.kind in ("gain", "zero"):
         return 1.0
     moving = [r for r in problem.records if not r.held]
     return float(
@@ -448,6 +453,13 @@ def _with_error(problem: BearingProblem, error: SensorError, by: float) -> Beari
     if error.kind == "fixed":
         numbers = (replace(n, value=n.value + by) if n.name == error.channel else n for n in problem.numbers)
         return replace(problem, numbers=tuple(numbers))
+    if error.kind == "zero":
+        far = [by * r.kept.mean(axis=0) * [not r.held, 0.0] for r in problem.records]
+        middle = np.mean([x for x, r in zip(far, problem.records, strict=True) if not r.held], axis=0)
+        apart = (x - middle * (not r.held) for x, r in zip(far, problem.records, strict=True))
+        return replace(
+            problem, records=tuple(replace(r, y=r.y + x) for r, x in zip(problem.records, apart, strict=True))
+        )
     gain, offset = (1.0 + by, 0.0) if error.kind == "gain" else (1.0, by)
     if error.channel == "time":
         return replace(

@@ -1,10 +1,11 @@
 """What is estimated from what: records, magnet law, numbers, and the layout of the vector that the search moves.
 
 The vector: free and prior numbers (the logarithm where physics needs them positive, else over their magnitudes), a free
-delay for each sampling rate, and each record's log noise levels (position, current, force, voltage, drift; of a held
-rotor current and voltage). Each touch of a stop hits the predictor with a force hundreds of times the noise: position
-and current are measured on, force and back-EMF are unknown; where the rotor lies on a stop, the record is cut. Any
-stretch without touches shows whether one magnet carries the weight: the mean of f/(m g) is (v_end - v_begin)/(g T) - 1.
+delay for each sampling rate, each record's log noise levels (position, current, force, voltage, drift; of a held rotor
+current and voltage), and zeros of the position that are a record's own. Each touch of a stop hits the predictor with a
+force hundreds of times the noise: position and current are measured on, force and back-EMF are unknown; where the rotor
+lies on a stop, the record is cut. Any stretch without touches shows whether one magnet carries the weight: the mean of
+f/(m g) is (v_end - v_begin)/(g T) - 1.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ class BearingRecord:
     # (n_samples,), bool, or None, samples that are left out, such as those of a rotor that lies on a stop; the
     # predictor begins anew after them. None: none.
     cut: NDArray[np.bool_] | None = None
+    zero: float | None = None  # of the position, m, taken out and searched beside the numbers; None: that of the rest
 
     @property
     def parts(self) -> tuple[tuple[int, int], ...]:
@@ -152,7 +154,17 @@ class BearingProblem:
     @property
     def size(self) -> int:
         """Length of the vector."""
-        return int(self.noise_slices[-1].stop)
+        return int(self.noise_slices[-1].stop) + sum(r.zero is not None for r in self.records)
+
+    def zero(self, r: int) -> int | None:
+        """Return the place in the vector of what is left of record `r`'s own zero, over `zero_scale`."""
+        own = [k for k, x in enumerate(self.records) if x.zero is not None]
+        return self.noise_slices[-1].stop + own.index(r) if r in own else None
+
+    @property
+    def zero_scale(self) -> float:
+        """Scale of the zeros in the vector, m."""
+        return float(np.std(np.concatenate([r.kept[:, 0] for r in self.records if not r.held])))
 
     @property
     def n_used(self) -> int:

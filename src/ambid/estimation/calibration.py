@@ -48,13 +48,14 @@ class _Source:
 
 def calibrated(
     estimate: E, rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str],
-    moves: Callable[[Sequence[SensorError]], Array], *, offsets: Mapping[str, str] | None = None,
+    moves: Callable[[Sequence[SensorError]], Array], *, offsets: Mapping[str, str] | None = None, places: bool = False,
 ) -> E:  # fmt: skip
     """Return an estimate with its intervals for what its rig says of calibration.
 
     `theta`: all numbers, SI; `names`: those that were estimated, in the order of what `moves` returns, d theta/d e of
     errors, (n_names, n_errors); `offsets`: of a law that is not linear, the number that is an offset, by channel: where
-    it is estimated, it takes up what the offset's error moves.
+    it is estimated, it takes up what the offset's error moves; `places`: whether records at several places
+    tell the law.
     """
     made, sources, own = cast("Any", estimate), _sources(rig, plant, theta), offsets or {}
     sources |= {
@@ -62,6 +63,8 @@ def calibrated(
         for c in rig.channels
         if c.offset_sd is not None and c.role in own and own[c.role] not in names
     }
+    if places:
+        sources["zeros"] = _Source(errors=[SensorError(kind="zero", channel="position")], sd=None)
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
     try:
         moved = moves(errors)

@@ -109,7 +109,7 @@ def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[M
         MagnetLaw(gap=gap, pair=pair, asymmetric=bool(magnet.asymmetric), saturation=saturation, rise=rise)
         for gap in gaps
     ]
-    return laws, [*(part for part in PARTS if getattr(magnet, part) is None), "drift"]
+    return laws, [*(part for part in PARTS if getattr(magnet, part) is None), "drift", "zeros"]
 
 
 def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
@@ -303,12 +303,19 @@ def judge_bearing(
         operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),
         hull=_hull(moving), coil_hull=_hull(points), criterion=fit.criterion,
         bic=fit.criterion + problem.size * float(np.log(problem.n_used)), checks=checks,
-        extended=("drift",) * (problem.drift and not (rig.magnet is not None and rig.magnet.drift)),
+        extended=_extended_by(fit, rig),
         warnings=_warnings(fit, checks, robust=robust) + changed,
     )  # fmt: skip
     return calibrated(
-        estimate, rig, rig.plant, estimate.values, spread.names, partial(bearing_moves, fit), offsets=_OFFSETS
-    )
+        estimate, rig, rig.plant, estimate.values, spread.names, partial(bearing_moves, fit), offsets=_OFFSETS,
+        places=sum(not r.held for r in problem.records) > 1 and all(r.zero is None for r in problem.records),
+    )  # fmt: skip
+
+
+def _extended_by(fit: BearingFit, rig: Rig) -> tuple[str, ...]:
+    asked = rig.magnet is not None and rig.magnet.drift
+    own = any(r.zero is not None for r in fit.problem.records)
+    return ("zeros",) * own + ("drift",) * (fit.problem.drift and not asked)
 
 
 def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
@@ -460,6 +467,13 @@ def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> 
     means = checks.get("ohm")
     if means is not None and means.passed and means.size is not None:
         warnings.append("R and v_offset are only known together, as far as the means of voltage and current go")
+    first, *others = (x for x in zip(fit.problem.records, _names(fit), strict=True) if not x[0].held)
+    warnings += [
+        f"{name}: its zero of the position is {1e3 * abs(r.zero):.3g} mm {'above' if r.zero > 0.0 else 'below'} "
+        f"that of {first[1]}; taken out of it"
+        for r, name in others
+        if r.zero is not None
+    ]
     if fit.problem.drift:
         warnings.append("a force and a voltage that drift absorb what the law does not explain")
     return tuple(warnings)

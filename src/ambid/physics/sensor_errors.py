@@ -14,7 +14,7 @@ from ambid.arrays import Array, Complex
 from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 from ambid.physics.rotor_model import RotorModel
 
-Kind = Literal["gain", "offset", "lag", "cross-talk", "fixed"]
+Kind = Literal["gain", "offset", "zero", "lag", "cross-talk", "fixed"]
 CHANNELS = ("voltage", "current", "position", "time")
 _LINES, _BEYOND = 60, 10.0  # of the default frequencies, and the factor by which they reach beyond the poles
 _RANK = 1e-9  # relative singular value of directions that no parameter is moved along
@@ -27,8 +27,9 @@ class SensorError:
     e.
 
     To first order a channel logs: gain s + e s, offset s + e, lag (or a pole at 1/e) s - e s', cross-talk s + e s_2,
-    time (1 + e) t. Where all that it scales is free, no record shows a gain: of the position sensor it moves m and k_x
-    by -2, k_i by -1 (one k_i fixes force and thesis eq. 4.4), if none is held. An offset moves no parameter.
+    time (1 + e) t; of a zero that moves between records, means (1 + e) times as far apart. Where all that it scales is
+    free, no record shows a gain: of the position sensor it moves m and k_x by -2, k_i by -1 (one k_i fixes force and
+    thesis eq. 4.4), if none is held. An offset moves no parameter.
     """
 
     kind: Kind

@@ -14,7 +14,7 @@ from ambid.estimation.estimate import Estimate, EstimatedParameter, OutputFit
 from ambid.estimation.result import Verdict
 from ambid.report.document import Column, Part, Table, grid
 from ambid.report.numbers import Quantity, quantity, sized
-from ambid.report.text import WORDS, Cell, fraction, names_words, pure
+from ambid.report.text import WORDS, Cell, fraction, pure
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
@@ -229,7 +229,8 @@ def calibration_lines(estimate: Estimate | NonlinearBearingEstimate | RotorEstim
             name, x = max(_shown(moves).items(), key=lambda item: abs(item[1]), default=("", 0.0))
             worst[bearing] = max(worst.get(bearing, (0.0, "")), (abs(x), f"{source} {name} {_per_cent(x)}"))
             continue
-        own = f"{source} (fixed)" if source in fixed else source.rpartition("_")[2].rstrip("0123456789")
+        between = "places of records against each other" if source == "zeros" else ""
+        own = f"{source} (fixed)" if source in fixed else between or source.rpartition("_")[2].rstrip("0123456789")
         kind = kinds.setdefault(own, dict.fromkeys(moves, 0.0))
         for name, x in moves.items():
             kind[name] += 0.0 if name in unseen else x
@@ -242,7 +243,7 @@ def calibration_lines(estimate: Estimate | NonlinearBearingEstimate | RotorEstim
             p.name == "m" for p in e.parameters
         )
         weigh = ", or weigh one thing: with m fixed, a wrong factor or clock shows" if unweighed else ""
-        weigh += f", and a prior with its sd for {names_words(fixed)}" if fixed else ""
+        weigh += f", and a prior with its sd for {', '.join(fixed)}" if fixed else ""
         lines.append(f"{first}1 % of gain moves: {'; '.join(words)}. Give gain_sd and rate_sd in the rig{weigh}")
     if planes:
         span = e.plant.span(e.numbers)  # type: ignore[union-attr]  # only rotors have planes
@@ -252,7 +253,7 @@ def calibration_lines(estimate: Estimate | NonlinearBearingEstimate | RotorEstim
         name.removesuffix(".offset") for name in stated if name.endswith(".offset") and name not in e.calibration
     ]
     only = "the number that stands for it" if law else "the operating point"
-    return [*lines, *([f"An offset of {names_words(offsets)} moves {only} alone"] if offsets else [])]
+    return [*lines, *([f"An offset of {', '.join(offsets)} moves {only} alone"] if offsets else [])]
 
 
 def _shown(moves: Mapping[str, float]) -> dict[str, float]:

@@ -331,7 +331,8 @@ def _each(fit: BearingFit) -> Iterator[BearingProblem]:
         kept = [k for k, x in enumerate(problem.records) if x.held or k == r]
         rates = {problem.records[k].rate_hz for k in kept}
         yield replace(
-            problem, records=tuple(problem.records[k] for k in kept), noise_center=problem.noise_center[kept],
+            problem, records=tuple(replace(problem.records[k], zero=None) for k in kept),
+            noise_center=problem.noise_center[kept],
             delays={rate: x for rate, x in problem.delays.items() if rate in rates},
             free_delay=problem.free_delay & rates,
         )  # fmt: skip
