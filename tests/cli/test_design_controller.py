@@ -78,7 +78,7 @@ def test_the_loop_becomes_an_object_of_python_control(designed):
         (("--spread", "delay=x"), "--spread delay=x has no number"),
         (("--spread", "dealy=1"), "source 'dealy' of spread is unknown"),
         (("--spread", "warm_k=0.1"), "it must be two numbers"),
-        (("--kind", "pod"), "method 'pod' of a design is unknown"),
+        (("--form", "pod"), "form 'pod' of gains is unknown"),
     ],
 )
 def test_what_is_asked_for_wrongly_is_refused_on_one_line(made, ambid, words, said):

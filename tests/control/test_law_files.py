@@ -9,10 +9,10 @@ import pytest
 from scipy.io import loadmat
 
 from ambid.control.law_files import write_law
-from ambid.control.lqg import lqg
 from ambid.errors import EstimationError
+from ambid.physics.law import beside
 from ambid.physics.loop import Loop
-from tests.control.test_lqg import of_preset, weights_of
+from tests.control.laws import of_preset
 
 DRIVER = """
 #include <stdio.h>
@@ -43,7 +43,8 @@ int main(void)
 def of_rotor():
     bench, plant = of_preset("rmit")
     signals = [f"{a}_{x}" for a in plant.axes for x in ("position", "current")]
-    return lqg(plant, weights_of(bench), bench.noise).law, signals, plant.model.inputs
+    law = beside([bench.loop.as_law(plant.rate_hz)] * len(plant.axes))
+    return law, signals, plant.model.inputs
 
 
 def of_gain():

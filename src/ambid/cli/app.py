@@ -69,8 +69,7 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "mqtt": "--json -, which any client of a broker passes on",
     },
     "design controller": {
-        "method": "--kind", "export": "--law", "judges": "",
-        "schedule": "--kind lqg with --speeds, one law for all",
+        "export": "--law", **dict.fromkeys(("method", "kind", "judges", "schedule"), ""),
     },
     "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},

@@ -55,7 +55,7 @@ def controller(v: Values) -> None:
     with Outputs(v.estimate, v.rig, **v.outputs) as outputs, progress("design") as show:
         outputs.claim(v.out, "out", force=v.force)
         outputs.claim(v.export, "export", LAW_ENDINGS)
-        how = v.only("method form filters speeds_rpm plants seed")
+        how = v.only("form filters speeds_rpm plants seed")
         how |= {"limits": _figures(v.limits or ()), "spread": _sources(v.spread or ())}
         found = design_controller(v.estimate, v.rig, goals=v.goals or GOALS, **how, tick=show)
         outputs.give(found, show)

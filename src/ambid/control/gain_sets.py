@@ -18,12 +18,11 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import FREQUENCIES, SETTLED, closed_loop_of
-from ambid.control.lqg import SampledPlant
 from ambid.physics.law import StateLaw, beside
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, delayed
 from ambid.physics.loop import Loop
 from ambid.physics.rotor_model import RotorModel
-from ambid.simulation.plant import fed_back
+from ambid.simulation.plant import fed_back, signals_fed_back
 
 FORMS = ("axes", "bearings")
 """One set for all axes, or one a bearing."""
@@ -212,6 +211,25 @@ _SHARP = 200.0  # exponent of the smooth maximum over axes and frequencies
 _SILENT = 0.1  # ln(c/SETTLED) of a pole that hardly takes part
 _EVEN = 30.0  # exponent of the smooth minimum over poles
 _SAME = 1e-3  # of a frequency: what is nearer to another is left out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledPlant:
+    """A plant over one sample, its states followed by the commands on their way; outputs as a `StateLaw` sees them."""
+
+    A: Array
+    B: Array
+    C: Array
+
+    @classmethod
+    def of(cls, plant: Plant) -> SampledPlant:
+        """Return the plant with the delay of each input, whole and fraction."""
+        d = delayed(plant.space, 1.0 / plant.rate_hz, plant.delays)
+        return cls(A=d.A, B=d.B, C=d.C[signals_fed_back(plant.model)])
+
+    def closed(self, law: StateLaw) -> Array:
+        """Return the matrix of the closed loop, states of the plant before those of the law."""
+        return np.block([[self.A + self.B @ law.D @ self.C, self.B @ law.C], [law.B @ self.C, law.A]])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
