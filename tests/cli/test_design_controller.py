@@ -27,8 +27,7 @@ def made(tmp_path_factory):
 @pytest.fixture(scope="module")
 def designed(made):
     """The files of a design, and its result."""
-    words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html",
-             "--law", made / "law.c")  # fmt: skip
+    words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ambid.job.controller_design._JUDGES", 12)
         assert run(["design", "controller", str(made / "e.json"), *FEW, *map(str, words)]) == 0

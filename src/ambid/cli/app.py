@@ -69,7 +69,8 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "mqtt": "--json -, which any client of a broker passes on",
     },
     "design controller": {
-        "export": "--law", **dict.fromkeys(("method", "kind", "judges", "schedule"), ""),
+        **dict.fromkeys(("export", "law"), "-o RIG, whose [loop] has the new gains or matrices"),
+        **dict.fromkeys(("method", "kind", "judges", "schedule"), ""),
     },
     "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},

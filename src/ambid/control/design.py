@@ -41,7 +41,7 @@ from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, rig_from_text
-from ambid.simulation.plant import closed_loop_matrix, fed_back, signals_fed_back
+from ambid.simulation.plant import closed_loop_matrix, fed_back
 
 SCHEMA = "ambid.design/1"
 FIGURES: Mapping[str, str] = MappingProxyType(
@@ -407,22 +407,6 @@ class Design(Judged):
     def _model(self) -> LinearModel:
         rotor = self.new_rig.rotor
         return model(self.model) if rotor is None else rotor
-
-    def export(self, path: str | Path) -> None:
-        """Write the new controller for another program, SI units, the sign included.
-
-        Parameters
-        ----------
-        path : str or Path
-            Ending in ``.mat``: A, B, C, D, G and the rate. In ``.py``: a script that makes it an object of
-            python-control. In ``.c``: C source in double precision that needs nothing else. A file that exists is
-            replaced.
-        """
-        from ambid.control.law_files import write_law
-
-        plant_model = self._model
-        signals = [plant_model.outputs[k] for k in signals_fed_back(plant_model)]
-        write_law(self.law, path, self.new_rig.name, signals, plant_model.inputs)
 
 
 def _turning(plant_model: LinearModel, speed: float) -> LinearModel:
