@@ -11,7 +11,7 @@ from ambid.control.closed import Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.design import GOALS, Goals, examine, noise_of, worst_of
 from ambid.control.drawn import draw_plants, over_speeds
-from ambid.control.gain_sets import FORMS, GainSets, RotorLoops, SampledPlant, form_of
+from ambid.control.gain_sets import FORMS, GainSets, Loops, SampledPlant, form_of
 from ambid.control.tuning import tune_pid
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent
@@ -52,7 +52,7 @@ def test_slopes_of_rotors_are_exact(turning):
     plants = [d.plant for d in draw_plants(plant, rig, 2, seed=3).plants]
     sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, "bearings"), 1)
     at = sets.at(rig.loop, (2500.0,))
-    loops = RotorLoops(plants=plants, noise=noise_of(rig.noise, {})[:2], sets=sets, around=at)
+    loops = Loops(plants=plants, noise=noise_of(rig.noise, {})[:2], sets=sets, around=at)
     at = at + 0.05 * np.sin(np.arange(at.size))
     (figures, slopes), (decays, falls) = loops.figures(at), loops.decays(at, integrates=True)
     for plant_of, found, decay in zip(plants, figures, decays, strict=True):
