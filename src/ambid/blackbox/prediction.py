@@ -24,8 +24,6 @@ from ambid.errors import EstimationError, ModelError
 from ambid.estimation.likelihood import run
 from ambid.physics.linear_model import zero_order_hold
 
-Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
-
 _FORGOTTEN = 1e-9  # what is left of an initial state when it no longer counts
 _RUNAWAY = 30.0  # log of the growth of an unstable predictor over the record from which nothing is left of its digits
 
@@ -131,16 +129,6 @@ class Sensitivities:
         inputs = np.ascontiguousarray(signals[:, : self._direct.shape[1]])
         out = (self._C @ rows.reshape(n, block * width)).reshape(n_y, block, width)[:, :, :-1]
         return np.asarray(out + inputs @ self._direct)
-
-
-def companion(den: Numbers) -> Numbers:
-    """Return the companion matrix (n, n) whose state k is p^k/F(p) times the input; `den`: F, highest power first,
-    monic; complex for a complex step.
-    """
-    n = den.size - 1
-    out = np.eye(n, k=1, dtype=den.dtype)
-    out[-1:] = -den[:0:-1]
-    return out
 
 
 Indices = NDArray[np.intp]
