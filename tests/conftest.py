@@ -20,7 +20,6 @@ LONGEST = (
     "examples/test_pages.py",
     "statistical/test_polynomial.py",
     "statistical/test_monte_carlo.py",
-    "statistical/test_sspem.py",
     "statistical/test_subspace.py",
     "bearing/test_physical.py",
     "real/test_nonlinear_maglev.py",

@@ -27,8 +27,7 @@ def made(tmp_path_factory):
 @pytest.fixture(scope="module")
 def designed(made):
     """The files of a design, and its result."""
-    words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html",
-             "--law", made / "law.c")  # fmt: skip
+    words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ambid.job.controller_design._JUDGES", 12)
         assert run(["design", "controller", str(made / "e.json"), *FEW, *map(str, words)]) == 0
@@ -78,7 +77,7 @@ def test_the_loop_becomes_an_object_of_python_control(designed):
         (("--spread", "delay=x"), "--spread delay=x has no number"),
         (("--spread", "dealy=1"), "source 'dealy' of spread is unknown"),
         (("--spread", "warm_k=0.1"), "it must be two numbers"),
-        (("--kind", "pod"), "method 'pod' of a design is unknown"),
+        (("--form", "pod"), "form 'pod' of gains is unknown"),
     ],
 )
 def test_what_is_asked_for_wrongly_is_refused_on_one_line(made, ambid, words, said):

@@ -54,10 +54,10 @@ def bearing(tmp_path_factory):
 
 def test_with_a_rig_physical_parameters_follow(bearing, ambid, monkeypatch):
     monkeypatch.chdir(bearing)
-    words = ("--rig", "rig.toml", "--structure", "sspem", "--orders", "n=4", "--json", "fit.json", "--strict")
+    words = ("--rig", "rig.toml", "--structure", "pbsid", "--orders", "n=4", "--json", "fit.json", "--strict")
     found = ambid("fit", "loop.csv", *words)
     assert found.code == 0, found.err
-    assert "physical parameters of model one-axis, from sspem" in found.out
+    assert "physical parameters of model one-axis, from pbsid" in found.out
     assert max(map(len, found.out.splitlines())) <= 80
     document = json.loads((bearing / "fit.json").read_text())
     assert (document["inputs"], document["outputs"]) == (["voltage"], ["position", "current"])
@@ -75,7 +75,7 @@ def test_with_a_rig_physical_parameters_follow(bearing, ambid, monkeypatch):
 
 def test_a_fit_that_cannot_carry_the_rig_s_model_is_refused(bearing, ambid, monkeypatch):
     monkeypatch.chdir(bearing)
-    words = ("--rig", "rig.toml", "--structure", "sspem", "--orders", "n=2", "--output", "position")
+    words = ("--rig", "rig.toml", "--structure", "pbsid", "--orders", "n=2", "--output", "position")
     refused = ambid("fit", "loop.csv", *words, "--json", "none.json")
     assert refused.code == 2
     assert len(refused.err.splitlines()) == 1

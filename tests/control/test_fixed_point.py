@@ -8,15 +8,15 @@ import pytest
 
 from ambid.acquisition.devices._kernels import law_tick
 from ambid.acquisition.law_words import BEGIN, law_words
-from ambid.control.knobs import Family
-from ambid.control.lqg import lqg
+from ambid.control.design import examine
 from ambid.errors import RigError
 from ambid.physics.law import l1_norms
-from tests.control.test_lqg import of_preset, weights_of
+from ambid.physics.loop import Loop
+from tests.control.laws import observer_law, of_preset
 
 POSITION, CURRENT, COMMAND = 2.5e-3 / 1024, 2.5 / 1024, 24.0 / 800  # SI of a count, of preset prototype
 REST = 400  # counts of pulse width
-KNOBS = [(1.0, 2.0), (0.1, 1.0), (1.0, 0.3)]
+KNOBS = [(1.0, 2.0), (0.5, 1.0), (0.5, 2.0)]
 
 
 def in_words(law):
@@ -26,8 +26,7 @@ def in_words(law):
 
 
 def designed(effort, disturbance):
-    bench, plant = of_preset("prototype")
-    return plant, lqg(plant, weights_of(bench), bench.noise, effort=effort, disturbance=disturbance).law
+    return observer_law("prototype", effort=effort, disturbance=disturbance)
 
 
 def ordered(law, y, low=0, high=800, z=None):
@@ -50,9 +49,9 @@ def test_l1_norms_are_the_largest_answers_to_bounded_signals():
 
 def moved(plant, law, realised):
     """By how many decibels the words move the peak of the sensitivity."""
-    family = Family(plants=(plant,))
-    assert family.poles(realised)[0] < 1.0
-    return 20.0 * math.log10(np.max(family.peaks(realised)) / np.max(family.peaks(law)))
+    exact, rounded = (examine(plant, Loop(law=x, delay=plant.delays[0]), (0.0, 0.0)).figures for x in (law, realised))
+    assert rounded.stable
+    return 20.0 * math.log10(rounded.peak / exact.peak)
 
 
 @pytest.mark.parametrize(("effort", "disturbance"), KNOBS)

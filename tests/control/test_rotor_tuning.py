@@ -11,13 +11,15 @@ from ambid.control.closed import Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.design import GOALS, Goals, examine, noise_of, worst_of
 from ambid.control.drawn import draw_plants, over_speeds
-from ambid.control.gain_sets import FORMS, GainSets, RotorLoops, form_of
+from ambid.control.gain_sets import FORMS, GainSets, Loops, SampledPlant, form_of
 from ambid.control.tuning import tune_pid
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent
 from ambid.physics.loop import Limits, Loop
 from ambid.rig.draft import rig_of_preset
+from ambid.simulation.plant import excited_loop
 from ambid.simulation.rotor_bench import RotorBench
+from tests.control.laws import of_preset
 
 
 def bench_of(name):
@@ -50,7 +52,7 @@ def test_slopes_of_rotors_are_exact(turning):
     plants = [d.plant for d in draw_plants(plant, rig, 2, seed=3).plants]
     sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, "bearings"), 1)
     at = sets.at(rig.loop, (2500.0,))
-    loops = RotorLoops(plants=plants, noise=noise_of(rig.noise, {})[:2], sets=sets, around=at)
+    loops = Loops(plants=plants, noise=noise_of(rig.noise, {})[:2], sets=sets, around=at)
     at = at + 0.05 * np.sin(np.arange(at.size))
     (figures, slopes), (decays, falls) = loops.figures(at), loops.decays(at, integrates=True)
     for plant_of, found, decay in zip(plants, figures, decays, strict=True):
@@ -118,3 +120,23 @@ def test_a_loop_goes_on_where_it_stopped():
             for k in (0, 30, 60)
         ]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.35, 1.0, 1.7, 2.0])
+def test_sampled_plant_is_that_of_the_simulation(delay):
+    _, plant = of_preset("prototype", delay)
+    of = SampledPlant.of(plant)
+    z, _, excited = excited_loop(plant.theta, Loop(delay=delay), plant.rate_hz, of=plant.model)
+    n = of.A.shape[0]
+    np.testing.assert_allclose(of.A, z[:n, :n], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(of.B[:, 0], excited[:n], rtol=1e-12)
+
+
+def test_inputs_may_be_late_by_different_times():
+    _, plant = of_preset("rmit")
+    plant = replace(plant, delays=np.array([0.0, 0.4, 1.0, 1.6]))
+    of, f = SampledPlant.of(plant), np.geomspace(1.0, 9000.0, 30)
+    z = np.exp(2j * np.pi * f / plant.rate_hz)[:, None, None] * np.eye(of.A.shape[0])
+    found = of.C @ np.linalg.solve(z - of.A, np.broadcast_to(of.B + 0j, (f.size, *of.B.shape)))
+    rows = [plant.model.outputs.index(f"{a}_{x}") for a in plant.axes for x in ("position", "current")]
+    np.testing.assert_allclose(found, plant.sampled(f).transfer()[:, rows], rtol=1e-7, atol=1e-12)

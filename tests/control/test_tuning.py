@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.control.design import FREQUENCIES, GOALS, Goals, examine, noise_of, worst_of
+from ambid.control.design import GOALS, Goals, examine, noise_of, worst_of
 from ambid.control.drawn import draw_plants
-from ambid.control.tuning import AxisLoops, Pid, _Search, tune_pid
+from ambid.control.gain_sets import GainSets, Loops, form_of
+from ambid.control.tuning import _Search, tune_pid
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent
 from tests.control.test_drawn import plant_of_preset
@@ -23,15 +24,16 @@ def bench():
     return plants, rig, noise, before
 
 
+def loops_of(plants, noise, loop):
+    sets = GainSets.of(loop, plants[0].model, plants[0].rate_hz, form_of(plants[0].model, "axes"))
+    return Loops(plants=plants, noise=noise, sets=sets, around=sets.at(loop))
+
+
 def test_all_plants_at_once_are_each_plant_alone(bench):
     plants, rig, noise, _ = bench
-    loops = AxisLoops(plants=plants, noise=noise, frequency_hz=plants[0].grid(FREQUENCIES))
-    pid = Pid.of(rig.loop, plants[0].rate_hz)
-    v, _ = pid.numbers(pid.at(rig.loop))
-    figures, decays = loops.figures(v)[0], loops.decays(v, integrates=True)[0]
-    for plant, (peak, compliance, noisy), decay in zip(plants, figures, decays, strict=True):
+    loops = loops_of(plants, noise, rig.loop)
+    for plant, (peak, compliance, noisy) in zip(plants, loops.figures(loops.around)[0], strict=True):
         alone = examine(plant, rig.loop, noise).figures
-        assert decay == pytest.approx(alone.pole, rel=1e-6)
         assert np.exp(noisy) == pytest.approx(alone.noise, rel=1e-3)
         assert np.exp(peak) == pytest.approx(alone.peak, rel=0.02)  # the smooth maximum lies above
         assert np.exp(compliance) == pytest.approx(alone.compliance, rel=0.02)
@@ -42,9 +44,10 @@ def test_all_plants_at_once_are_each_plant_alone(bench):
 def test_slopes_are_exact(bench, changes):
     plants, rig, noise, before = bench
     loop = replace(rig.loop, **changes)
-    pid = Pid.of(loop, plants[0].rate_hz)
+    loops = loops_of(plants, noise, loop)
+    pid = loops.sets
     search = _Search(
-        loops=AxisLoops(plants=plants, noise=noise, frequency_hz=plants[0].grid(60)), pid=pid, decay=20.0,
+        loops=loops, pid=pid, decay=20.0,
         reference={name: getattr(before, name) for name in ("peak", "compliance", "noise", "settling")},
     )  # fmt: skip
     at, step = pid.at(loop), 1e-6

@@ -7,13 +7,12 @@ import pytest
 
 from ambid.acquisition.devices._kernels import law_tick, watch
 from ambid.acquisition.law_words import BEGIN, WATCH_MS, law_words
-from ambid.control.lqg import lqg
 from ambid.errors import AmbidError
 from ambid.job.acquiring import acquire
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Loop
 from tests.bars.host import prototype
-from tests.control.test_lqg import of_preset, weights_of
+from tests.control.laws import observer_law
 from tests.firmware.controller_host import Host
 from tests.firmware.native.console import LEVITATING, LIMITS
 from tests.firmware.test_firmware_emulated import BENCH, PLANT, gains_for
@@ -154,10 +153,9 @@ def record_of(bench_program, firmware_elf, tmp_path):
 
 
 @pytest.mark.parametrize("armed", [False, True], ids=["lifted off", "armed"])
-def test_lqg_in_fixed_point_is_that_in_floating_point(record_of, armed):
+def test_a_law_in_fixed_point_is_that_in_floating_point(record_of, armed):
     """Peak of the sensitivity within 0.1 dB on the emulated bench."""
-    bench, plant = of_preset("prototype")
-    law = lqg(plant, weights_of(bench), bench.noise).law
+    _, law = observer_law("prototype")
     x, i, u, e = (np.fft.rfft(v - v.mean()) for v in record_of(law, armed=armed))
     lines = np.abs(e) > 0.2 * np.abs(e).max()
     x, i, u, e = x[lines], i[lines], u[lines], e[lines]

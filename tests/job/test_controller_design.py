@@ -7,6 +7,7 @@ import pytest
 
 import ambid
 from ambid.acquisition.settings import held_by, law_trial
+from ambid.control import tuning
 from ambid.control.design import UNSTABLE, Examined, Figures, Goals, worst_of
 from ambid.errors import EstimationError
 from ambid.job import controller_design as room
@@ -37,7 +38,7 @@ def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
     monkeypatch.setattr(room, "_JUDGES", 3)
 
     def given(change):
-        monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: change(rig.loop))
+        monkeypatch.setattr(tuning, "tune_pid", lambda plants, rig, goals, tick, **_: change(rig.loop))
 
     given(lambda loop: replace(loop, kd=0.7 * loop.kd))
     with pytest.raises(
@@ -58,7 +59,7 @@ def test_what_is_promised_counts_disturbances_as_they_were_identified(monkeypatc
     rig = replace(rig, noise=replace(rig.noise, force=12.0 * rig.noise.force))
     known = ambid.identify(ambid.simulate(rig, duration=1.0, seed=1, amplitude=5.0), rig)
     monkeypatch.setattr(room, "_JUDGES", 2)
-    monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: rig.loop)
+    monkeypatch.setattr(tuning, "tune_pid", lambda plants, rig, goals, tick, **_: rig.loop)
     found = design_controller(known, replace(rig, noise=None), plants=2)
     quiet = ambid.simulate(rig, duration=2.0, seed=2, amplitude=1e-9)
     for s in (found.before, found.after):
@@ -73,7 +74,7 @@ def test_a_rotors_loop_with_a_higher_peak_is_refused_too(monkeypatch):
     known = ambid.identify(ambid.simulate("rmit", duration=1.0, seed=1), rig)
     worse = replace(rig.loop, kd=0.7 * rig.loop.kd)
     monkeypatch.setattr(room, "_JUDGES", 2)
-    monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: worse)
+    monkeypatch.setattr(tuning, "tune_pid", lambda plants, rig, goals, tick, **_: worse)
     with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or limits={'peak': "):
         design_controller(known, rig, plants=2)
 

@@ -19,7 +19,7 @@ EXPERIMENT = (
     {"closed": "open"}, {"seed": -1}, {"seed": 2.5},
 )  # fmt: skip
 CONTROLLER = (
-    {"goals": 5}, {"goals": "peak"}, {"limits": 5}, {"limits": {"peak": "a"}}, {"spread": 5}, {"method": ["pid"]},
+    {"goals": 5}, {"goals": "peak"}, {"limits": 5}, {"limits": {"peak": "a"}}, {"spread": 5},
     {"filters": -1}, {"plants": 2.5}, {"seed": -1}, {"rig": 5},
     {"speeds_rpm": (1,)}, {"form": [1]},
 )  # fmt: skip

@@ -135,15 +135,12 @@ def test_only_a_pair_can_be_unequal():
         MagnetLaw(asymmetric=True)
 
 
-def test_an_unequal_pair_is_a_case_of_the_law_too():
-    magnet = DifferentialPair(turns=138, area=470e-6, bias=1.0, gap=0.43e-3, leakage=2e-3, k_asym=0.1, bias_asym=-0.05)
+def test_a_pair_of_the_presets_is_a_case_of_the_law_too():
+    magnet = DifferentialPair(turns=138, area=470e-6, bias=1.0, gap=0.43e-3, leakage=2e-3)
     ideal, numbers = magnet.coenergy, law_numbers(magnet.coenergy)
-    assert (numbers["k_asym"], numbers["i0_asym"]) == pytest.approx((0.1, -0.05))
-    law, x, i = MagnetLaw(pair=True, asymmetric=True), 1.3e-4, 0.4
-    table, _ = law.table(np.array([x]), np.array([i]), numbers)
+    x, i = 1.3e-4, 0.4
+    table, _ = MagnetLaw(pair=True).table(np.array([x]), np.array([i]), numbers)
     wanted = [ideal.force(x, i), ideal.displacement_coefficient(x, i), ideal.force_per_current(x, i),
               ideal.inductance(x)]  # fmt: skip
     assert table[0] == pytest.approx(wanted, rel=1e-12)
     assert ideal.force(x, magnet.holding_current(x, 12.0)) == pytest.approx(-12.0, rel=1e-9)
-    with pytest.raises(ModelError, match="keep a strength"):
-        DifferentialPair(turns=138, area=470e-6, bias=1.0, gap=0.43e-3, k_asym=1.0)

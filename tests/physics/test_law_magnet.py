@@ -11,8 +11,7 @@ from ambid.physics.magnet import DifferentialPair, SingleMagnet
 IDEAL = (
     (SingleMagnet(k=1.3e-4, leakage=0.1), MagnetLaw(), 0.010, 0.9),
     (
-        DifferentialPair(turns=138, area=470e-6, bias=1.0, gap=0.43e-3, leakage=2e-3, k_asym=0.1, bias_asym=0.05),
-        MagnetLaw(pair=True, asymmetric=True), 8e-5, -0.3,
+        DifferentialPair(turns=138, area=470e-6, bias=1.0, gap=0.43e-3, leakage=2e-3), MagnetLaw(pair=True), 8e-5, -0.3,
     ),
 )  # fmt: skip
 COIL = {"L_leak": 0.08, "L_rise": 0.03, "i_knee": 0.6, "sigma": 0.4}

@@ -27,8 +27,7 @@ def test_pair_obeys_the_design_formulas() -> None:
 
 
 def test_single_magnet_obeys_the_force_law() -> None:
-    magnet = SingleMagnet.from_geometry(turns=200, area=1e-4)
-    assert magnet.k == pytest.approx(4e-7 * math.pi * 200**2 * 1e-4, rel=1e-15)
+    magnet = SingleMagnet(k=MU_0 * 200**2 * 1e-4)
     assert magnet.coenergy.force(2e-3, 1.5) == pytest.approx(-0.5 * magnet.k * (1.5 / 2e-3) ** 2, rel=1e-14)
     # Maxwell's stress B^2 A/(2 mu0) with B = mu0 n i/gap: the same number by another way
     b = MU_0 * 200 * 1.5 / 2e-3

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
+from ambid.physics.coenergy_law import MagnetLaw, law_numbers
+from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
@@ -23,7 +25,10 @@ PAIR = NonlinearPlant(
 
 LOSSY = replace(
     PAIR,
-    magnet=replace(PAIR.magnet, k_asym=0.1, bias_asym=0.05),
+    magnet=LawMagnet(
+        law=MagnetLaw(pair=True, asymmetric=True),
+        values={**law_numbers(PAIR.magnet.coenergy), "k_asym": 0.1, "i0_asym": 0.05},
+    ),
     R=1.6,
     c=30.0,
     stage=PowerStage(v_drop=0.8, i_drop=0.3),

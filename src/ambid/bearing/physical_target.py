@@ -72,8 +72,7 @@ def target_of(fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str]) ->
     _check_poles(fit, model, rows, columns)
     if fit.covariance is None:
         raise EstimationError(
-            f"the {fit.structure} model has no covariance. Use a method that gives one (arx, armax, oe, bj, sspem, "
-            "pbsid)"
+            f"the {fit.structure} model has no covariance. Use a method that gives one (arx, armax, oe, bj, pbsid)"
         )
     if isinstance(fit.model, TransferModel) and fit.model.delay_estimated:
         # the match holds the delay where it was found: what is open about it stands in the coefficients' own spread

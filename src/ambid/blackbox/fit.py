@@ -106,8 +106,6 @@ STRUCTURES = _register(
     ("cva", "state space", "subspace", "n", "biased", f"{_INNOVATIONS}, subspace by canonical variates"),
     ("pbsid", "state space", "subspace", "n", "consistent",
      f"{_INNOVATIONS}, subspace from a long autoregression; consistent in closed loop"),
-    ("sspem", "state space", "state_space_search", "n", "with noise model",
-     f"{_INNOVATIONS} by prediction error: statistically efficient"),
     ("blocks", "transfer function", "blocks", "nk", "consistent",
      "i = K_a/(s+a) u + K_b/(s+b) x, x = K_c/(s+c) i, continuous time (mass 1, no inertia)"),
 )  # fmt: skip

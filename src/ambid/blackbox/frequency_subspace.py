@@ -155,7 +155,6 @@ class _Trial:
 class _Asked:
     """What `frf_subspace` was asked for beside the order."""
 
-    p: float | None
     delay: float
     feedthrough: bool
     domain: Literal["s", "z"]
@@ -165,15 +164,13 @@ def frf_subspace(
     frf: FrequencyResponse,
     orders: Orders | Literal["auto"],
     *,
-    p: float | None = None,
     delay: float = 0.0,
     feedthrough: bool = False,
     domain: Literal["s", "z"] = "s",
 ) -> BlackBoxFit:
     """Identify a state space from a frequency response. `orders`: ``n``; "auto", or left out: the lowest whose refined
-    cost noise explains, else that of least BIC; `p`: rad/s, of the Laguerre operator, default of least mean square
-    error on a grid over the band; `delay`: of all inputs in s, known; `feedthrough`: whether D is estimated; `domain`:
-    z for held inputs only.
+    cost noise explains, else that of least BIC; `delay`: of all inputs in s, known; `feedthrough`: whether D is
+    estimated; `domain`: z for held inputs only. The p of the Laguerre operator is that of least mean square error.
     """
     if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
         raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")
@@ -188,7 +185,7 @@ def frf_subspace(
     wanted: Orders = {} if isinstance(orders, str) else orders
     check_order_names("frf-subspace", wanted, ("n",))
     n = None if left_open(wanted, "n") else single_order("frf-subspace", wanted, "n", 1)
-    asked = _Asked(p=p, delay=delay, feedthrough=feedthrough, domain=domain)
+    asked = _Asked(delay=delay, feedthrough=feedthrough, domain=domain)
     with one_thread():
         return _choose_order(frf, asked) if n is None else _of_order(frf, n, asked)
 
@@ -268,7 +265,7 @@ def _start(frf: FrequencyResponse, n: int, asked: _Asked) -> tuple[Lines, int, _
             "measure more lines"
         )
     rows = int(max(least, min(2 * n + 2, most // 2)))  # 2 n + 2 where the lines can tell so many apart
-    return ln, rows, _best_operator(ln, n, rows, asked.feedthrough, asked.p), n_estimated
+    return ln, rows, _best_operator(ln, n, rows, asked.feedthrough), n_estimated
 
 
 def _points(ln: Lines) -> Complex:
@@ -276,10 +273,8 @@ def _points(ln: Lines) -> Complex:
     return np.asarray(1j * (2 / ln.dt * np.tan(ln.omega * ln.dt / 2) if ln.held else ln.omega), dtype=np.complex128)
 
 
-def _best_operator(ln: Lines, n: int, rows: int, feedthrough: bool, p: float | None) -> _Trial:
+def _best_operator(ln: Lines, n: int, rows: int, feedthrough: bool) -> _Trial:
     """The p of least mean square error."""
-    if p is not None:
-        return _trial(ln, n, rows, feedthrough, p)
     omega = _points(ln).imag
     positive = omega[omega > 0]
     grid = [best_conditioned(positive, rows - 1), *np.geomspace(positive[0], positive[-1], _GRID + 2)[1:-1]]

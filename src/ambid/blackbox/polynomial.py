@@ -286,7 +286,7 @@ def missed_minimum(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: S
             warnings.append(
                 f"{f'output {o}: ' if len(fits) > 1 else ''}a longer model fits significantly better ({less:.1%} "
                 f"of the squared residual, {p_text(p)}) and the search was hard: it may have missed a better "
-                "minimum, or the orders are too low. Try pbsid or sspem, or raise the orders"
+                "minimum, or the orders are too low. Try pbsid, or raise the orders"
             )
     return warnings
 

@@ -24,8 +24,6 @@ from ambid.errors import EstimationError, ModelError
 from ambid.estimation.likelihood import run
 from ambid.physics.linear_model import zero_order_hold
 
-Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
-
 _FORGOTTEN = 1e-9  # what is left of an initial state when it no longer counts
 _RUNAWAY = 30.0  # log of the growth of an unstable predictor over the record from which nothing is left of its digits
 
@@ -96,29 +94,27 @@ def _free_responses(F: Array, C: Array, n_samples: int) -> Array:
 
 class Sensitivities:
     """Sensitivities that move along a record block by block, along `directions` (n_theta, n_directions) of
-    ``model.theta`` and, if `initial`, of the n states at the first sample.
+    ``model.theta``.
     """
 
-    def __init__(self, model: StateSpaceModel, directions: Array, *, initial: bool = False) -> None:
+    def __init__(self, model: StateSpaceModel, directions: Array) -> None:
         n, n_u, n_y, d = model.order, model.n_inputs, model.n_outputs, directions.shape[1]
         ends = np.cumsum([n * n, n * n_u, n_y * n, n_y * n_u, n * n_y])
         shapes = ((n, n), (n, n_u), (n_y, n), (n_y, n_u), (n, n_y))
         dA, dB, dC, dD, dK = (
             part.reshape(*shape, d) for part, shape in zip(np.split(directions, ends[:-1]), shapes, strict=True)
         )
-        extra = n if initial else 0
         push = [dA - np.tensordot(model.K, dC, 1), dB - np.tensordot(model.K, dD, 1), dK]
-        self._forcing = np.zeros((n, n + n_u + n_y, d + extra + 1))  # the last column belongs to the kernel
+        self._forcing = np.zeros((n, n + n_u + n_y, d + 1))  # the last column belongs to the kernel
         self._forcing[:, :, :d] = np.concatenate(push, axis=1)
-        self._direct = np.zeros((n_y, n + n_u, d + extra))
-        self._direct[:, :, :d] = np.concatenate([dC, dD], axis=1)
+        self._direct = np.zeros((n_y, n + n_u, d))
+        self._direct[:] = np.concatenate([dC, dD], axis=1)
         self._F = np.ascontiguousarray(model.A - model.K @ model.C)
         self._C = model.C
-        self._state = np.zeros((n, d + extra + 1))
-        self._state[:, d : d + extra] = np.eye(n, extra)
+        self._state = np.zeros((n, d + 1))
 
     def block(self, signals: Array) -> Array:
-        """Return the derivatives (n_outputs, block, n_directions; n more with first states) of the predictions of the
+        """Return the derivatives (n_outputs, block, n_directions) of the predictions of the
         next samples by `signals` (block, n + n_inputs + n_outputs): states before, inputs, one-step errors without a
         constant taken off.
         """
@@ -133,16 +129,6 @@ class Sensitivities:
         inputs = np.ascontiguousarray(signals[:, : self._direct.shape[1]])
         out = (self._C @ rows.reshape(n, block * width)).reshape(n_y, block, width)[:, :, :-1]
         return np.asarray(out + inputs @ self._direct)
-
-
-def companion(den: Numbers) -> Numbers:
-    """Return the companion matrix (n, n) whose state k is p^k/F(p) times the input; `den`: F, highest power first,
-    monic; complex for a complex step.
-    """
-    n = den.size - 1
-    out = np.eye(n, k=1, dtype=den.dtype)
-    out[-1:] = -den[:0:-1]
-    return out
 
 
 Indices = NDArray[np.intp]

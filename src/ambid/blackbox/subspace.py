@@ -7,10 +7,10 @@ once to triangular factors, without each group of time for the covariance (jackk
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -158,40 +158,6 @@ def _feedthrough(data: IOData, factors: Factors, total: Array, past: int) -> boo
     return bool(factors.n_rows * (without - with_it) > n_u * n_y * np.log(factors.n_rows))
 
 
-def build_subspace_fit(
-    name: str,
-    data: IOData,
-    plan: Plan,
-    scaled: Realisation,
-    covariance: Array | None,
-    details: Mapping[str, object],
-    criterion: Array | None,
-    **more: Any,
-) -> BlackBoxFit:
-    """Give the numbers their units and put the result together; `covariance` (n_theta, n_theta) is of the scaled
-    coefficients, `criterion` that of the order, `more` as `build_fit` takes it.
-    """
-    model, scale = to_units(scaled, plan.channels, data.dt)
-    if covariance is not None:
-        covariance = covariance * np.outer(scale, scale)
-        covariance = 0.5 * (covariance + covariance.T)
-    return build_fit(
-        name,
-        data,
-        orders={"n": model.order},
-        model=model,
-        covariance=covariance,
-        noise_covariance=scaled.innovation * np.outer(plan.channels.scale_y, plan.channels.scale_y),
-        details={
-            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
-            "order_criterion": None if criterion is None else criterion.tolist(),
-            "feedthrough": plan.feedthrough,
-            **details,
-        },
-        **more,
-    )
-
-
 def to_units(scaled: Realisation, channels: Channels, dt: float) -> tuple[StateSpaceModel, Array]:
     """Return the model in SI, and what its coefficients were multiplied by, (n_theta,)."""
     u, y = channels.scale_u, channels.scale_y
@@ -215,16 +181,7 @@ def offsets(scaled: Realisation, plan: Plan) -> Offsets:
     for k in range(now - 1, -1, -1):
         error = error - row @ (G @ mean[f.columns("z", k, k + 1)])
         row = row @ F
-    return operating_point(scaled, plan.channels, error)
-
-
-def operating_point(scaled: Realisation, channels: Channels, error: Array) -> Offsets:
-    """Return the shortest shift of the channels' means that takes `error` (n_outputs,), scaled, off the innovations'
-    mean.
-    """
-    s = scaled.model
-    n, n_u = s.A.shape[0], s.B.shape[1]
-    F, G = s.A - s.K @ s.C, np.hstack([s.B - s.K @ s.D, s.K])
+    n, n_u, channels = s.A.shape[0], s.B.shape[1], plan.channels
     at_rest = s.C @ np.linalg.solve(np.eye(n) - F, G)
     slope = np.hstack([np.eye(s.C.shape[0]) - at_rest[:, n_u:], -(s.D + at_rest[:, :n_u])])
     shift = np.linalg.lstsq(slope, -error, rcond=1e-6)[0]
@@ -257,28 +214,21 @@ def estimate(
     declared open loop and shows one, as a controller that acts within the sample cannot be told from a feedthrough.
     """
     with one_thread():
-        first = first_model(method, data, orders, horizon, feedthrough, tick)
-        plan, others = first.plan, []
+        plan = plan_estimate(method, data, orders, horizon, feedthrough, tick)
+        criterion = None if plan.n else order_criterion(plan)
+        n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
+        if method != "pbsid" and horizon is None:
+            plan = _choose_horizons(plan, n)
+        check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
+        prior, states = decomposition(plan)
+        first = FirstModel(plan=plan, given=prior, found=states, full=model_of(plan, states, n), criterion=criterion)
+        others = []
         for factor in leave_each_out(plan.factors.arranged(_columns(plan))):
             if tick is not None:
                 tick()
-            others.append(model_of(plan, _decompose(plan, factor, first.given), first.full.model.order))
+            others.append(model_of(plan, _decompose(plan, factor, prior), n))
         covariance = jackknife(first.full, others, plan.future, with_bias=method != "pbsid")
     return _result(method, data, first, covariance)
-
-
-def first_model(
-    method: Method, data: IOData, orders: Orders, horizon: int | None, feedthrough: bool | None, tick: Tick
-) -> FirstModel:
-    """Compress, decompose, choose the order, regress."""
-    plan = plan_estimate(method, data, orders, horizon, feedthrough, tick)
-    criterion = None if plan.n else order_criterion(plan)
-    n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
-    if method != "pbsid" and horizon is None:
-        plan = _choose_horizons(plan, n)
-    check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
-    prior, states = decomposition(plan)
-    return FirstModel(plan=plan, given=prior, found=states, full=model_of(plan, states, n), criterion=criterion)
 
 
 def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
@@ -357,13 +307,17 @@ def order_criterion(plan: Plan) -> Array:
 
 
 def _result(method: Method, data: IOData, first: FirstModel, covariance: Array | None) -> BlackBoxFit:
-    """Say what has to be said of the numbers."""
+    """Give the numbers their units and say what has to be said of them; `covariance`: of the scaled coefficients."""
     plan, prior, full = first.plan, first.given, first.full
     n, n_y, n_u = full.model.order, data.n_outputs, data.n_inputs
-    y = plan.channels.scale_y
+    y, criterion = plan.channels.scale_y, first.criterion
+    model, scale = to_units(full, plan.channels, data.dt)
     warnings = []
     if covariance is None:
         warnings.append("no standard deviations: parts of the record do not identify the same states. Lower n")
+    else:
+        covariance = covariance * np.outer(scale, scale)
+        covariance = 0.5 * (covariance + covariance.T)
     if not full.stable_predictor:
         warnings.append("no gain gives a stable predictor: its predictions diverge. Change n")
     columns = _columns(plan)[: -n_y if plan.method == "pbsid" else -n_y * plan.future]  # the regressors, scaled
@@ -371,17 +325,20 @@ def _result(method: Method, data: IOData, first: FirstModel, covariance: Array |
     related = input_relation(plan.factors, plan.total, data.inputs, plan.past) if method == "pbsid" else None
     if related is not None:  # its long autoregression has no unique solution, and the prior shares the effect out
         warnings.append(f"{related}: pbsid may attribute their effects wrongly. Use cva or n4sid, or omit one")
-    return build_subspace_fit(
+    return build_fit(
         method,
         data,
-        plan,
-        full,
-        covariance,
-        criterion=first.criterion,
+        orders={"n": n},
+        model=model,
+        covariance=covariance,
+        noise_covariance=full.innovation * np.outer(y, y),
         n_estimated=n * (2 * n_y + n_u) + (n_u * n_y if plan.feedthrough else 0),
         offsets=offsets(full, plan),
         warnings=warnings,
         details={
+            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
+            "order_criterion": None if criterion is None else criterion.tolist(),
+            "feedthrough": plan.feedthrough,
             "singular_values": first.found.values.tolist(),
             "covariance": {"kind": "jackknife", "groups": int(plan.factors.groups.shape[0])},
             "condition_number": float(sizes[0] / max(sizes[-1], 1e-18 * sizes[0])),  # at most: beyond is rounding

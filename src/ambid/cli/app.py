@@ -69,8 +69,8 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
         "mqtt": "--json -, which any client of a broker passes on",
     },
     "design controller": {
-        "method": "--kind", "export": "--law", "judges": "",
-        "schedule": "--kind lqg with --speeds, one law for all",
+        **dict.fromkeys(("export", "law"), "-o RIG, whose [loop] has the new gains or matrices"),
+        **dict.fromkeys(("method", "kind", "judges", "schedule"), ""),
     },
     "design experiment": {"lines": "", "slew": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},

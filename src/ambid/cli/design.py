@@ -50,12 +50,10 @@ def controller(v: Values) -> None:
     """
     from ambid.control.design import GOALS
     from ambid.job import design_controller
-    from ambid.job.files import LAW_ENDINGS
 
     with Outputs(v.estimate, v.rig, **v.outputs) as outputs, progress("design") as show:
         outputs.claim(v.out, "out", force=v.force)
-        outputs.claim(v.export, "export", LAW_ENDINGS)
-        how = v.only("method form filters speeds_rpm plants seed")
+        how = v.only("form filters speeds_rpm plants seed")
         how |= {"limits": _figures(v.limits or ()), "spread": _sources(v.spread or ())}
         found = design_controller(v.estimate, v.rig, goals=v.goals or GOALS, **how, tick=show)
         outputs.give(found, show)
@@ -63,8 +61,6 @@ def controller(v: Values) -> None:
             from ambid.rig import rig_text
 
             outputs.stage_text(v.out, rig_text(found.new_rig, v.out.parent))
-        if v.export is not None:
-            outputs.stage(v.export, found.export)
     outputs.show(found, strict=v.strict)
 
 

@@ -77,7 +77,7 @@ _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     "rig": ({}, {"text": str}, ".toml"),
     "identify": ({"record": "record", "rig": "rig"}, {}, ".json"),
     "margins": ({"record": "record", "rig": "rig", "estimate": "result"}, {}, ".json"),
-    "design": ({"rig": "rig", "estimate": "result"}, {"method": str}, ".json"),
+    "design": ({"rig": "rig", "estimate": "result"}, {}, ".json"),
     "export": ({"record": "record"}, {"from_s": float, "to_s": float}, ".h5"),
     "live": (
         {"rig": "rig", "estimate": "result", "arm": "rig"},
@@ -91,7 +91,6 @@ _FILES = ("record", "ledger", "rig", "estimate", "arm")
 _CHOICES = {
     "pace": ("real-time", "fastest"),
     "excitation": ("multisine", "schroeder", "prbs", "steps"),
-    "method": ("pid", "lqg"),
     "gaps": ("error", "interpolate", "cut"),
     "weights": tuple(WINDOWS),
 }

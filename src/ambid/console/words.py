@@ -5,7 +5,7 @@ from collections.abc import Mapping
 PAGE_WORDS: Mapping[str, str] = {
     "rate_hz": "Rate", "gaps": "Gaps", "out": "the name", "rig": "Rig", "port": "Port", "seconds": "Length",
     "excitation": "Excitation", "amplitude": "Amplitude", "estimate": "Start", "arm": "Loop to try",
-    "redesign": "redesign the loop", "method": "Method",
+    "redesign": "redesign the loop",
     "layout": "layout in [record] of the rig", "from_s": "from in [record] of the rig",
     "to_s": "to in [record] of the rig", "reference": "[channels.reference] of the rig",
     "delay": "delay of the channel in the rig", "bench": "daq.bench of the rig", "identify": "Identify",

@@ -350,7 +350,7 @@ def _design(worker: Worker) -> None:
     from ambid.rig import rig_text
 
     estimate = worker.named("estimate")
-    found = design_controller(estimate, worker.path("rig"), method=worker.spec.get("method", "pid"), tick=worker.tick)
+    found = design_controller(estimate, worker.path("rig"), tick=worker.tick)
     name = worker.give(found)
     with (worker.folder / f"{name}.toml").open("x", encoding="utf-8") as file:
         file.write(rig_text(found.new_rig, worker.folder))

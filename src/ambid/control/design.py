@@ -1,6 +1,6 @@
 """What is asked of a controller, what it does on one plant and on many, and the design as a result.
 
-It is judged on plants of `ambid.control.drawn` that its method has not seen. Figures to be small are minimised
+It is judged on plants of `ambid.control.drawn` that the search has not seen. Figures to be small are minimised
 together, the largest over the plants of each over that of the present loop, of the peak no more than zone A allows; all
 are limited, by the present loop's where nothing else is said, as the peak alone is smallest without an integrator.
 """
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, rig_from_text
-from ambid.simulation.plant import closed_loop_matrix, fed_back, signals_fed_back
+from ambid.simulation.plant import closed_loop_matrix, fed_back
 
 SCHEMA = "ambid.design/1"
 FIGURES: Mapping[str, str] = MappingProxyType(
@@ -134,14 +134,6 @@ class Goals:
         return replace(
             goals, limits={n: x / (beyond[n] * SAME if n in beyond else 1.0) for n, x in goals.limits.items()}
         )
-
-
-class Method(Protocol):
-    """How a controller is designed: for plants, the estimate's first, in a rig whose [loop] is the present one."""
-
-    def __call__(self, plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-        """Return the loop; EstimationError where none meets the limits, with the one to move."""
-        ...
 
 
 def on(loop: Loop, plant: Plant) -> Loop:
@@ -340,6 +332,7 @@ class Design(Judged):
         Of the estimate that the plant comes from.
     model : str
     method : str
+        "pid": the present structure, tuned.
     record : Mapping[str, object]
         That the estimate comes from.
     goals : Goals
@@ -414,22 +407,6 @@ class Design(Judged):
     def _model(self) -> LinearModel:
         rotor = self.new_rig.rotor
         return model(self.model) if rotor is None else rotor
-
-    def export(self, path: str | Path) -> None:
-        """Write the new controller for another program, SI units, the sign included.
-
-        Parameters
-        ----------
-        path : str or Path
-            Ending in ``.mat``: A, B, C, D, G and the rate. In ``.py``: a script that makes it an object of
-            python-control. In ``.c``: C source in double precision that needs nothing else. A file that exists is
-            replaced.
-        """
-        from ambid.control.law_files import write_law
-
-        plant_model = self._model
-        signals = [plant_model.outputs[k] for k in signals_fed_back(plant_model)]
-        write_law(self.law, path, self.new_rig.name, signals, plant_model.inputs)
 
 
 def _turning(plant_model: LinearModel, speed: float) -> LinearModel:

@@ -1,5 +1,5 @@
-"""PIDs on many axes as one law: the same gains on all, or a set a bearing. A filter in the position of every set,
-around a bending mode, is a notch, or turns the phase where zeros and poles stand apart:
+"""PIDs as one law, of one axis or many: the same gains on all, or a set a bearing. A filter in the position of every
+set, around a bending mode, is a notch, or turns the phase where zeros and poles stand apart:
 
 F(s) = (w_p/w_z)² (s² + 2 zeta_z w_z s + w_z²)/(s² + 2 zeta_p w_p s + w_p²), s = (2/T) (z - 1)/(z + 1),
 
@@ -18,12 +18,11 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import FREQUENCIES, SETTLED, closed_loop_of
-from ambid.control.lqg import SampledPlant
 from ambid.physics.law import StateLaw, beside
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, delayed
 from ambid.physics.loop import Loop
 from ambid.physics.rotor_model import RotorModel
-from ambid.simulation.plant import fed_back
+from ambid.simulation.plant import fed_back, signals_fed_back
 
 FORMS = ("axes", "bearings")
 """One set for all axes, or one a bearing."""
@@ -33,7 +32,7 @@ _STEP = 1e-5  # of the logarithms, for slopes of responses and of the law's matr
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pid:
-    """What may change in a loop: its numbers as `AxisLoops` takes them, with the signs of the present ones."""
+    """What may change in a loop: its numbers, with the signs of the present ones."""
 
     signs: Array  # (4,): of kp, ki, kd, kc; 0 where the present loop has none, and keeps none
     period: float
@@ -55,15 +54,14 @@ class Pid:
         sizes = np.abs([loop.kp, loop.ki * T, loop.kd / (loop.filter_s + T), loop.kc, tau])
         return np.asarray(np.log(np.where(sizes > 0.0, sizes, 1.0)))
 
-    def numbers(self, at: Array) -> tuple[Array, Array]:
-        """Return kp, ki T, q, kc and p, and their slopes by the logarithms."""
+    def numbers(self, at: Array) -> Array:
+        """Return kp, ki T, q, kc and p."""
         tau, T = math.exp(at[4]), self.period
-        v = np.append(self.signs * np.exp(at[:4]), tau / (tau + T) if self.signs[2] else 0.0)
-        return v, np.append(v[:4], tau * T / (tau + T) ** 2 if self.signs[2] else 0.0)
+        return np.append(self.signs * np.exp(at[:4]), tau / (tau + T) if self.signs[2] else 0.0)
 
     def loop(self, at: Array, present: Loop) -> Loop:
         """Return the loop."""
-        v, _ = self.numbers(at)
+        v = self.numbers(at)
         tau = math.exp(at[4])
         return replace(
             present, kp=float(v[0]), ki=float(v[1] / self.period), kd=float(v[2] * (tau + self.period)),
@@ -121,10 +119,6 @@ class GainSets:
         idle = [np.log([w, w, _WIDE, _WIDE]) for w in around]
         return np.concatenate([*[self.pid.at(loop)] * len(self.form.names), *idle])
 
-    def numbers(self, at: Array) -> tuple[Array, Array]:
-        """Return the numbers as `RotorLoops` takes them, the logarithms, and their slopes by them."""
-        return at, np.ones(at.size)
-
     def parts(self, at: Array) -> tuple[Array, Array]:
         """Return the numbers by set, (n_sets, 5), and by filter, (n_filters, 4)."""
         n = 5 * len(self.form.names)
@@ -152,7 +146,7 @@ class GainSets:
 
     def current_gain(self, at: Array, k: int) -> float:
         """Return kc of set `k`."""
-        return float(self.pid.numbers(self.parts(at)[0][k])[0][3])
+        return float(self.pid.numbers(self.parts(at)[0][k])[3])
 
     def slopes(self, at: Array, k: int, frequency_hz: Array) -> tuple[Complex, Complex]:
         """Return the position's response of set `k` without sign, and its slopes by all numbers, (..., n_numbers)."""
@@ -167,7 +161,7 @@ class GainSets:
 
     def _response(self, at: Array, k: int, frequency_hz: Array) -> Complex:
         gains, filters = self.parts(at)
-        (kp, ki, q, _, p), _ = self.pid.numbers(gains[k])
+        kp, ki, q, _, p = self.pid.numbers(gains[k])
         back = np.exp(-2j * np.pi * frequency_hz * self.pid.period)
         K = kp + ki * back / (1.0 - back) + q * (1.0 - back) / (1.0 - p * back)
         for one in filters:
@@ -198,7 +192,7 @@ def _filtered(law: StateLaw, one: Array) -> StateLaw:
     )  # fmt: skip
 
 
-# The figures of many rotors in their loop, and their slopes by the gains, for the search of `ambid.control.tuning`.
+# The figures of many plants in their loop, and their slopes by the gains, for the search of `ambid.control.tuning`.
 #
 # With H from the commands and G from forces at the magnets, to what is fed back y and to the magnets z, the controller
 # K = Σ_s M_s [k_s, kc_s] of the sets s, N = (I + K H)⁻¹ K and Z = I - H N:
@@ -215,8 +209,27 @@ _SAME = 1e-3  # of a frequency: what is nearer to another is left out
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RotorLoops:
-    """Many plants on many axes, of one rate."""
+class SampledPlant:
+    """A plant over one sample, its states followed by the commands on their way; outputs as a `StateLaw` sees them."""
+
+    A: Array
+    B: Array
+    C: Array
+
+    @classmethod
+    def of(cls, plant: Plant) -> SampledPlant:
+        """Return the plant with the delay of each input, whole and fraction."""
+        d = delayed(plant.space, 1.0 / plant.rate_hz, plant.delays)
+        return cls(A=d.A, B=d.B, C=d.C[signals_fed_back(plant.model)])
+
+    def closed(self, law: StateLaw) -> Array:
+        """Return the matrix of the closed loop, states of the plant before those of the law."""
+        return np.block([[self.A + self.B @ law.D @ self.C, self.B @ law.C], [law.B @ self.C, law.A]])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Loops:
+    """Many plants of one rate, on the same axes."""
 
     plants: Sequence[Plant]
     noise: tuple[float, float]  # of position and current, m and A rms
@@ -316,7 +329,7 @@ class RotorLoops:
         """
         laws, decays, slopes = self._laws(at), [], []
         for sampled in self.sampled:
-            n, (decay, values, left, right, scale) = sampled.A.shape[0], self._slow(sampled, laws[0], integrates)
+            n, (decay, values, left, right, moved) = sampled.A.shape[0], self._slow(sampled, laws[0], integrates)
             near = np.flatnonzero(decay < decay.min() + 10.0 * self._pace / _EVEN)
             share = np.exp(-_EVEN * (decay[near] - decay.min()) / self._pace)
             rates = []
@@ -327,7 +340,7 @@ class RotorLoops:
                     a @ ((p.D - m.D) @ b + (p.C - m.C) @ d) + c @ ((p.B - m.B) @ b + (p.A - m.A) @ d)
                     for p, m in zip(laws[1::2], laws[2::2], strict=True)
                 ])  # fmt: skip
-            rises = -np.real(np.array(rates) / (2.0 * _STEP * values[near, None])) * scale[near, None]
+            rises = np.real(np.array(rates) / (2.0 * _STEP * values[near, None]) * moved[near, None])
             decays.append(decay.min() - math.log(share.sum()) * self._pace / _EVEN)
             slopes.append(share @ rises / share.sum())
         return np.array(decays), np.array(slopes)
@@ -346,17 +359,21 @@ class RotorLoops:
 
     def _slow(
         self, sampled: SampledPlant, law: StateLaw, integrates: bool
-    ) -> tuple[Array, Complex, Complex, Complex, Array]:
-        """Return decays as `decays` counts them, poles, left and right vectors, and decay over -ln|pole|."""
+    ) -> tuple[Array, Complex, Complex, Complex, Complex]:
+        """Return decays as `decays` counts them, poles, left and right vectors, and what the real part of it times the
+        relative change of a pole is the change of its decay.
+        """
         values, right = np.linalg.eig(sampled.closed(law))
         left = np.linalg.inv(right).T  # axes that are alike have the same poles: vectors one by one would not fit
-        part = 1.0 / (1.0 + (np.angle(values) * self.rate_hz) ** 2 / self._stiff)
+        turn = np.angle(values) * self.rate_hz**2 / self._stiff
+        part = 1.0 / (1.0 + np.angle(values) * turn)
         weight = np.maximum(np.log(part / SETTLED), _SILENT)
         scale = self.rate_hz * math.log(1.0 / SETTLED) / weight
         decay = -np.log(np.maximum(np.abs(values), _STEP)) * scale
+        bends = np.where(weight > _SILENT, 2.0 * decay / weight * turn * part, 0.0)  # with the frequency
         if not integrates:  # what nothing feeds stays where it is
             decay[np.abs(values - 1.0) < _STEP**2] = np.inf
-        return decay, values, left, right, scale
+        return decay, values, left, right, -scale - 1j * bends
 
     def _laws(self, at: Array) -> list[StateLaw]:
         """Return the law, then those with each number a little larger and smaller."""

@@ -1,13 +1,8 @@
-"""The PID of `ambid.physics.loop.Loop` tuned over many plants at once; of rotors also one a bearing or by motion.
+"""The PID of `ambid.physics.loop.Loop` tuned over many plants at once; of rotors also one a bearing.
 
-Of one axis kp, ki T, q = kd/(tau + T), kc and p = tau/(tau + T) stand in K = kp + ki T/(z - 1) + q (1 - 1/z)/(1 - p/z):
-responses H (by a voltage) and G (by a force) are computed once, slopes are exact. With D = 1 + kc H_i + K H_x:
-
-S = (1 + kc H_i)/D, x/f = (G_x + kc (G_x H_i - H_x G_i))/D, u/n = (K, kc)/D.
-
-The largest logarithm of each figure is minimised as an epigraph, limits' common excess penalised exactly (Nocedal and
-Wright 2006, sec. 17.2 and 18.5): where it stays, no design meets them. The slowest pole stands for settling, corrected
-by what the force steps show.
+The largest logarithm of each figure of `ambid.control.gain_sets.Loops` is minimised as an epigraph, limits' common
+excess penalised exactly (Nocedal and Wright 2006, sec. 17.2 and 18.5): where it stays, no design meets them. Poles
+stand for settling, corrected by what the force steps show.
 """
 
 from __future__ import annotations
@@ -15,27 +10,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from ambid.arrays import Array, Complex
+from ambid.arrays import Array
 from ambid.control.closed import Plant
 from ambid.control.design import (
     FIGURES,
-    FREQUENCIES,
     SAME,
     UNSTABLE,
     Figures,
     Goals,
-    closed_loop_of,
     examine,
-    mean_over,
     noise_of,
-    on,
     worst_of,
 )  # fmt: skip
-from ambid.control.gain_sets import GainSets, Pid, RotorLoops, form_of
+from ambid.control.gain_sets import GainSets, Loops, Pid, form_of
 from ambid.errors import EstimationError, ModelError
 from ambid.estimation.progress import Tick
 from ambid.physics.linear_model import OneAxis
@@ -43,9 +33,7 @@ from ambid.physics.loop import Loop, placed_loop
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.settings.caller import setting
-from ambid.simulation.plant import closed_loop_matrix
 
-_SHARP = 200.0  # exponent of the smooth maximum over the frequencies
 _SLOW = 0.02  # decay over that of the present loop, from which its logarithm goes on as a straight line
 _RANGE = math.log(30.0)  # of each gain, up and down from the present one
 _STEPS = 60  # of a search
@@ -60,112 +48,12 @@ _DAMPING = (0.02, 2.0)  # of zeros and poles of a filter
 _PLACED = (0.6, 1.0, 1.6)  # over the plant's own rate, where poles are placed to start from
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AxisLoops:
-    """Many plants of one axis, of one rate."""
-
-    plants: Sequence[Plant]
-    noise: tuple[float, float]  # of position and current, m and A rms
-    frequency_hz: Array
-
-    @cached_property
-    def rate_hz(self) -> float:
-        """Sampling rate in Hz."""
-        return self.plants[0].rate_hz
-
-    @cached_property
-    def responses(self) -> tuple[Complex, ...]:
-        """H_x, H_i, G_x and G_x H_i - H_x G_i, each (n_plants, n)."""
-        responses = []
-        for plant in self.plants:
-            outputs = plant.model.outputs.index("position"), plant.model.outputs.index("current")
-            loop = closed_loop_of(plant, Loop(), self.frequency_hz)
-            by_forces, by_inputs = loop.pushed
-            (G_x, G_i), (H_x, H_i) = by_forces[:, outputs, plant.space.E.shape[1]].T, by_inputs[:, outputs, 0].T
-            responses.append((H_x, H_i, G_x, G_x * H_i - H_x * G_i))
-        return tuple(np.array(x) for x in zip(*responses, strict=True))
-
-    @cached_property
-    def matrices(self) -> Array:
-        """Matrix of the closed loop without gains, and its slopes by the five numbers, (6, n_plants, n, n)."""
-        T = 1.0 / self.rate_hz
-        probes = (Loop(), Loop(kp=1.0), Loop(ki=1.0 / T), Loop(kd=T), Loop(kc=1.0))
-        lagged = Loop(derivative_cutoff_hz=1.0 / (2.0 * math.pi * T))  # p = 1/2
-        matrices = []
-        for plant in self.plants:
-            z = np.array([closed_loop_matrix(plant.theta, on(p, plant), self.rate_hz, of=plant.model)
-                          for p in (*probes, lagged)])  # fmt: skip
-            matrices.append(np.concatenate([z[:1], z[1:] - z[0]]) * np.array([1, 1, 1, 1, 1, 2])[:, None, None])
-        size = max(z.shape[1] for z in matrices)
-        wide = np.zeros((6, len(matrices), size, size))
-        for k, z in enumerate(matrices):
-            wide[:, k, : z.shape[1], : z.shape[1]] = z
-        return wide
-
-    def decays(self, v: Array, *, integrates: bool) -> tuple[Array, Array]:
-        """Return the decay of the slowest pole of each plant in 1/s, and its slopes by the numbers, (n_plants, 5)."""
-        z = self.matrices[0] + np.einsum("j,jkab->kab", v, self.matrices[1:])
-        if not integrates:  # what nothing feeds stays where it is: no pole of the loop
-            z = z - self._integral
-        values, right = np.linalg.eig(z)
-        others, left = np.linalg.eig(np.swapaxes(z, 1, 2))
-        k, many = np.argmax(np.abs(values), axis=1), np.arange(len(values))
-        at = values[many, k]
-        j = np.argmin(np.abs(others - at[:, None]), axis=1)
-        w, x = left[many, :, j], right[many, :, k]
-        slopes = np.einsum("ka,jkab,kb->kj", w, self.matrices[1:], x) / np.sum(w * x, axis=1)[:, None]
-        return -np.log(np.abs(at)) * self.rate_hz, -np.real(slopes / at[:, None]) * self.rate_hz
-
-    @cached_property
-    def _integral(self) -> Array:
-        """The place of the integral that stays, (n_plants, n, n)."""
-        matrix = np.zeros(self.matrices.shape[1:])
-        k, i, _ = np.nonzero(self.matrices[2])  # what ki changes is the integral's own row
-        matrix[k, i, i] = 1.0
-        return matrix
-
-    def figures(self, v: Array) -> tuple[Array, Array]:
-        """Return the logarithms of peak, compliance and noise, (n_plants, 3), and their slopes, (n_plants, 3, 5)."""
-        H_x, H_i, G_x, W = self.responses
-        back = np.exp(-2j * np.pi * self.frequency_hz / self.rate_hz)
-        kp, ki, q, kc, p = v
-        sum_, lag = back / (1.0 - back), 1.0 / (1.0 - p * back)
-        rise = (1.0 - back) * lag
-        K = kp + ki * sum_ + q * rise
-        rises = (1.0 + 0.0 * back, sum_, rise, None, q * rise * back * lag)  # of K
-        inner, lent = 1.0 + kc * H_i, G_x + kc * W
-        D = inner + K * H_x
-        d = [H_i if b is None else b * H_x for b in rises]  # of D
-        far = np.stack([-x / D for x in d], axis=2)
-        S, soft = far.copy(), far
-        S[:, :, 3] += H_i / inner
-        soft = far.copy()
-        soft[:, :, 3] += W / lent
-        figures, slopes = [], []
-        for size, slope in ((np.abs(inner / D), S), (np.abs(lent / D), soft)):
-            ln = np.log(size)
-            top = ln.max(axis=1)
-            weight = np.exp(_SHARP * (ln - top[:, None]))
-            total = weight.sum(axis=1)
-            figures.append(top + np.log(total) / _SHARP)
-            slopes.append(np.einsum("kf,kfj->kj", weight / total[:, None], slope.real))
-        power, change = 0.0, 0.0
-        for sd, A, own in ((self.noise[0], K / D, rises), (self.noise[1], kc / D, (None, None, None, 1.0, None))):
-            power = power + sd**2 * np.abs(A) ** 2
-            rates = [A * far[:, :, j] + (0.0 if b is None else b / D) for j, b in enumerate(own)]
-            change = change + sd**2 * 2.0 * np.real(np.conj(A)[:, :, None] * np.stack(rates, axis=2))
-        mean = mean_over(self.frequency_hz, np.transpose(power))
-        figures.append(0.5 * np.log(mean))
-        slopes.append(0.5 * mean_over(self.frequency_hz, np.transpose(change, (1, 0, 2))) / mean[:, None])
-        return np.stack(figures, axis=1), np.stack(slopes, axis=1)
-
-
 @dataclass(kw_only=True, eq=False)
 class _Search:
     """One problem: what is minimised and limited, over plants; evaluated once for each point."""
 
-    loops: AxisLoops | RotorLoops
-    pid: Pid | GainSets
+    loops: Loops
+    pid: GainSets
     reference: Mapping[str, float]
     decay: float  # 1/s, of the present loop, by which settling is judged
 
@@ -176,13 +64,12 @@ class _Search:
         """Return ln(figure/reference), (n_plants, 4) in the order of `FIGURES`, and slopes by the logarithms."""
         key = point.tobytes()
         if self._last is None or self._last[0] != key:
-            v, chain = self.pid.numbers(point)
-            figures, slopes = self.loops.figures(v)
-            decay, fall = self.loops.decays(v, integrates=bool(self.pid.signs[1]))
+            figures, slopes = self.loops.figures(point)
+            decay, fall = self.loops.decays(point, integrates=bool(self.pid.signs[1]))
             share = np.maximum(decay / self.decay, _SLOW)
             slow = -np.log(share) + (share - decay / self.decay) / _SLOW
             values = np.column_stack([figures - np.log([self.reference[n] for n in list(FIGURES)[:3]]), slow])
-            rates = np.concatenate([slopes, (-fall / self.decay / share[:, None])[:, None]], axis=1) * chain
+            rates = np.concatenate([slopes, (-fall / self.decay / share[:, None])[:, None]], axis=1)
             self._last = key, (values, rates)
         return self._last[1]
 
@@ -246,54 +133,12 @@ def tune_pid(
         raise EstimationError(
             "[loop] is a state-space law, whose structure is no PID. Give a PID in [loop] to start from"
         )
-    problem_class = _Rotors if isinstance(plants[0].model, RotorModel) else _OneAxis
-    return _tuned(problem_class.of(plants, rig, form, filters), goals, tick)
+    return _tuned(_Problem.of(plants, rig, form, filters), goals, tick)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _OneAxis:
-    """What is tuned: plants of one axis, all of which are looked at all the time."""
-
-    plants: Sequence[Plant]
-    present: Loop
-    noise: tuple[float, float]
-    pid: Pid
-    bounds: Array
-
-    @classmethod
-    def of(cls, plants: Sequence[Plant], rig: Rig, form: str, filters: int) -> _OneAxis:
-        """Return the problem of a rig."""
-        if not all(isinstance(p.model, OneAxis) for p in plants):
-            raise EstimationError(
-                "a PID is tuned for one axis with its coil (model one-axis) or a rotor; the estimate is of another"
-            )
-        if form != "axes" or filters:
-            raise EstimationError("forms and filters of gains are of a rotor; the estimate is of one axis. Omit them")
-        assert rig.loop is not None
-        pid = Pid.of(rig.loop, plants[0].rate_hz)
-        return cls(
-            plants=plants, present=rig.loop, noise=noise_of(rig.noise, {})[:2], pid=pid,
-            bounds=bounds_of(rig, pid, pid.at(rig.loop)),
-        )  # fmt: skip
-
-    def starts(self) -> list[Array]:
-        """Return where searches start, the present loop first."""
-        return [self.pid.at(self.present), *_placed(self.plants[0], self.present, self.pid, self.bounds)]
-
-    def looked_at(self, figures: Sequence[Figures], before: Sequence[int]) -> list[int]:  # noqa: ARG002
-        """Return which plants to look at, by the figures of a loop on all of them."""
-        return list(range(len(self.plants)))
-
-    def loops(self, which: Sequence[int], at: Array) -> AxisLoops:  # noqa: ARG002
-        """Return some plants in their loop."""
-        return AxisLoops(
-            plants=[self.plants[k] for k in which], noise=self.noise, frequency_hz=self.plants[0].grid(FREQUENCIES)
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Rotors:
-    """What is tuned: rotors, of which those are looked at that were the worst of all in any figure."""
+class _Problem:
+    """What is tuned: plants, of which those are looked at that were the worst of all in any figure."""
 
     plants: Sequence[Plant]
     present: Loop
@@ -303,10 +148,16 @@ class _Rotors:
     bounds: Array
 
     @classmethod
-    def of(cls, plants: Sequence[Plant], rig: Rig, form: str, filters: int) -> _Rotors:
+    def of(cls, plants: Sequence[Plant], rig: Rig, form: str, filters: int) -> _Problem:
         """Return the problem of a rig."""
         assert rig.loop is not None
         first = plants[0]
+        if not isinstance(first.model, (OneAxis, RotorModel)):
+            raise EstimationError(
+                "a PID is tuned for one axis with its coil (model one-axis) or a rotor; the estimate is of another"
+            )
+        if isinstance(first.model, OneAxis) and (form != "axes" or filters):
+            raise EstimationError("forms and filters of gains are of a rotor; the estimate is of one axis. Omit them")
         own = sorted(x for name, x in first.theta.items() if name.startswith("mode") and name.endswith(".omega"))
         if filters > len(own):
             raise EstimationError(
@@ -324,8 +175,10 @@ class _Rotors:
         )  # fmt: skip
 
     def starts(self) -> list[Array]:
-        """Return where searches start: the present loop."""
-        return [self.pid.at(self.present, self.around)]
+        """Return where searches start: the present loop, and placed poles of one axis."""
+        one = isinstance(self.plants[0].model, OneAxis)
+        placed = _placed(self.plants[0], self.present, self.pid.pid, self.bounds) if one else []
+        return [self.pid.at(self.present, self.around), *placed]
 
     def looked_at(self, figures: Sequence[Figures], before: Sequence[int]) -> list[int]:
         """Return the plants of before and those that are now the worst, by much, in any figure."""
@@ -337,12 +190,12 @@ class _Rotors:
                 chosen.append(k)
         return list(dict.fromkeys(chosen))
 
-    def loops(self, which: Sequence[int], at: Array) -> RotorLoops:
+    def loops(self, which: Sequence[int], at: Array) -> Loops:
         """Return some plants in their loop."""
-        return RotorLoops(plants=[self.plants[k] for k in which], noise=self.noise, sets=self.pid, around=at)
+        return Loops(plants=[self.plants[k] for k in which], noise=self.noise, sets=self.pid, around=at)
 
 
-def _tuned(problem: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
+def _tuned(problem: _Problem, goals: Goals, tick: Tick) -> Loop:
     """Return the best loop: on some plants, until it does as well on all."""
     starts, done = problem.starts(), 0
 
@@ -359,11 +212,11 @@ def _tuned(problem: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
         n: math.log(x / goals.reference[n]) + (_SMOOTH if n in own else -_SLACK * (n not in unworsened))
         for n, x in goals.limits.items()
     }
-    which = problem.looked_at([] if isinstance(problem, _OneAxis) else figures_of(problem.present), [])
+    which = problem.looked_at(figures_of(problem.present), [])
     first = best = starts[0]
     for k in range(_ROUNDS):
         loops = problem.loops(which, starts[0])
-        decays = loops.decays(problem.pid.numbers(first)[0], integrates=bool(problem.pid.signs[1]))[0]
+        decays = loops.decays(first, integrates=bool(problem.pid.signs[1]))[0]
         search = _Search(
             loops=loops, pid=problem.pid, reference=goals.reference,
             decay=max(float(np.min(decays)), 1e-3 * loops.rate_hz / 1e3),
@@ -400,7 +253,7 @@ def _worst(figures: Sequence[Figures]) -> Figures:
 
 
 def _between(
-    problem: _OneAxis | _Rotors,
+    problem: _Problem,
     ends: tuple[Array, Array],
     figures_of: Callable[[Loop], Sequence[Figures]],
     goals: Goals,

@@ -6,9 +6,8 @@ Read -> plants drawn -> the present loop on them -> design -> as the controller 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from ambid.control.design import (
     Design,
     Examined,
     Goals,
-    Method,
     OverSpeed,
     checks_of,
     curves_of,
@@ -60,28 +58,11 @@ _TURNED = 5  # plants that are turned at speeds, for the curve
 _STEP = 1.5  # settling times over which a force step is drawn
 
 
-def _pid() -> Method:
-    from ambid.control.tuning import tune_pid
-
-    return tune_pid
-
-
-def _lqg() -> Method:
-    from ambid.control.knobs import design_lqg
-
-    return design_lqg
-
-
-METHODS: Mapping[str, Callable[[], Callable[..., Loop]]] = {"pid": _pid, "lqg": _lqg}
-"""By the name that ``method`` takes: what designs is imported when it is asked for."""
-
-
 @of_job("design controller")
 def design_controller(
     estimate: Numbers | str | Path,
     rig: RigSource | None = None,
     *,
-    method: str = "pid",
     goals: Sequence[str] = GOALS,
     limits: Mapping[str, float] | None = None,
     spread: Mapping[str, Any] | None = None,
@@ -92,7 +73,7 @@ def design_controller(
     seed: int = 0,
     tick: Tick | None = None,
 ) -> Design:
-    """Design the controller of an identified bearing, and verify it on plants around the estimate.
+    """Tune the controller of an identified bearing, and verify it on plants around the estimate.
 
     The largest over many plants of each goal, over what the present loop has (of the peak, what zone A allows where
     the present one is higher), is minimised; no figure may become worse, unless a limit says otherwise. The plants
@@ -105,9 +86,6 @@ def design_controller(
         The plant, as `ambid.identify` finds it.
     rig : Rig, path, dict or TOML text, optional
         With the present ``[loop]``; default: that of the estimate.
-    method : {"pid", "lqg"}
-        "pid": the present structure, tuned; "lqg": a state-space law with integral action by the mean of noise and
-        disturbances, its weights tuned.
     goals : sequence of {"peak", "compliance", "noise", "settling"}
         What is to be small: peak of the sensitivity, displacement by a force, noise of the sensors in the command,
         time in which a force step is settled.
@@ -156,18 +134,18 @@ def design_controller(
     known, bench = given(estimate, rig)
     asked, sources = _ratios(limits), _spread(spread)
     Goals.of(goals, asked, UNSTABLE)  # refuses what it does not know, before anything is drawn
-    if str(method) not in METHODS:
-        names = f"{', '.join(METHODS)}.{nearest(method, list(METHODS))}"
-        raise EstimationError(f"method {method!r} of a design is unknown; known: {names} Give one of them")
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
     check_whole({"plants": plants}, 1)
     check_whole({"seed": seed, "filters": filters})
-    design = _method(method, form, filters)
+    if str(form) not in FORMS:
+        raise EstimationError(
+            f"form {form!r} of gains is unknown: {', '.join(FORMS)}.{nearest(form, list(FORMS))} Give one of them"
+        )
     speeds = _speeds(known, bench, speeds_rpm)
     with one_thread():
         problem = _problem(known, bench, sources, plants, seed, speeds)
-        found = _designed(problem, method, design, goals, asked, say, clock)
+        found = _designed(problem, form, filters, goals, asked, say, clock)
     return replace(found, timing_s=clock.laps)
 
 
@@ -202,19 +180,6 @@ class _Problem:
         """The loop as it is."""
         assert self.rig.loop is not None
         return self.rig.loop
-
-
-def _method(name: str, form: str, filters: int) -> Method:
-    """Return a method with the form of a PID's gains; refuse these of another method."""
-    if name != "pid":
-        if form != "axes" or filters:
-            raise EstimationError(f"form and filters are of a PID, not of {name}. Omit them, or give method pid")
-        return METHODS[name]()
-    if str(form) not in FORMS:
-        raise EstimationError(
-            f"form {form!r} of gains is unknown: {', '.join(FORMS)}.{nearest(form, list(FORMS))} Give one of them"
-        )
-    return partial(METHODS[name](), form=form, filters=filters)
 
 
 def _speeds(known: Numbers, bench: Rig, given: tuple[float, float] | None) -> Interval | None:
@@ -256,9 +221,11 @@ def _problem(known: Numbers, bench: Rig, spread: Spread, plants: int, seed: int,
 
 
 def _designed(
-    problem: _Problem, method: str, design: Method, goals: Sequence[str], limits: Mapping[str, float], say: Tick,
+    problem: _Problem, form: str, filters: int, goals: Sequence[str], limits: Mapping[str, float], say: Tick,
     clock: Clock,
 ) -> Design:  # fmt: skip
+    from ambid.control.tuning import tune_pid
+
     of, plants = problem, [d.plant for d in problem.tuning.plants]
     refuse_unheld(examine(of.plant, of.present, of.noise).figures, "the estimated plant")
     before = verify(of.tuning.plants, of.present, of.noise, part_of(say, 0.0, 0.3) or silent)
@@ -268,7 +235,7 @@ def _designed(
     judged = Goals.of(goals, limits, worst_of([x.figures for x in first]))  # the present loop on the same plants
     for k in range(_ROUNDS):
         try:
-            made = design(plants, of.rig, asked, say)
+            made = tune_pid(plants, of.rig, asked, say, form=form, filters=filters)
         except EstimationError:
             if not k:
                 raise
@@ -281,7 +248,7 @@ def _designed(
         asked = closer
     clock.lap("design")
     _refuse_worse(judged, first, seen)
-    found = _result(of, method, judged, ((of.present, first), (loop, seen)), made, say)
+    found = _result(of, judged, ((of.present, first), (loop, seen)), made, say)
     clock.lap("verify")
     return found
 
@@ -310,9 +277,8 @@ def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Exam
 
 
 def _result(
-    of: _Problem, method: str, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...], made: Loop,
-    say: Tick,
-) -> Design:  # fmt: skip
+    of: _Problem, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...], made: Loop, say: Tick
+) -> Design:
     """Return the result; `made`: the new loop before rounding, which the controller rounds once."""
     noise = _disturbed(of)
     was, now = (situation_of(seen, of.plant, loop, noise) for loop, seen in loops)
@@ -337,7 +303,7 @@ def _result(
     until = _STEP * max(was.figures.settling, now.figures.settling)
     kept = replace(made, delay=of.bench.loop.delay if of.bench.loop else loop.delay)  # the rig's own, as it says it
     return Design(
-        status=of.known.status, model=of.known.model, method=method, record=of.known.record, goals=goals, before=was,
+        status=of.known.status, model=of.known.model, method="pid", record=of.known.record, goals=goals, before=was,
         after=now, worst_plant=worst, checks=checks, rate_hz=of.plant.rate_hz, trials=trials,
         curves={
             name: curves_of(x, of.plant, loop, until)

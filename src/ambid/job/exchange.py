@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,10 @@ from ambid.arrays import Array, Complex
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.prediction import plant_form
-from ambid.control.law_files import comment_text, write_mat
 from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.estimation.estimate import Continuous
-from ambid.job.files import EXPORT_ENDINGS, Files
+from ambid.job.files import EXPORT_ENDINGS, MAT_HEADER, Files
+from ambid.job.plant_source import comment_text
 from ambid.job.results import rig_of
 from ambid.physics.linear_model import UNITS, StateSpace, delayed, model
 from ambid.physics.loop import UNLIMITED
@@ -387,3 +388,12 @@ def _stiffnesses(estimate: RotorEstimate, rig: Any, whirl: Array) -> dict[float,
             return {abs(estimate.speed): stiffness}
         found[abs(speed)] = stiffness
     return found
+
+
+def write_mat(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a ``.mat`` file, version 5, whose header says that it comes from here and not when."""
+    from scipy.io import savemat
+
+    written = BytesIO()
+    savemat(written, content, long_field_names=True, oned_as="column")
+    path.write_bytes(MAT_HEADER.ljust(116) + written.getvalue()[116:])

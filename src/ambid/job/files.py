@@ -18,14 +18,13 @@ _NOTES = "-metadata.json"  # the ending of what belongs to another file
 _LOOKED = 64  # bytes of a file that say what it is
 _MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
 EXPORT_ENDINGS = (".mat", ".py", ".c", ".h", ".fmu")
-LAW_ENDINGS = (".mat", ".py", ".c")
 METRICS_ENDINGS = (".prom",)
-_MATRICES = b"MATLAB 5.0 MAT-file, written by ambid"  # as `control.law_files.MAT_HEADER`
+MAT_HEADER = b"MATLAB 5.0 MAT-file, written by ambid"
+"""With what ``.mat`` files begin that were written here, so that no other is written over."""
 _ARCHIVE = b"documentation/made-by-ambid.txt"  # the first entry of an FMU, as `fmu.MARK`
 _BEGINNINGS = {
     FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<", b"%PDF"),
-    EXPORT_ENDINGS: (_MATRICES, b'"""The plant of ', b"/* The plant of "),
-    LAW_ENDINGS: (_MATRICES, b'"""The law of ', b"/* The law of "), METRICS_ENDINGS: (b"# HELP ambid_",),
+    EXPORT_ENDINGS: (MAT_HEADER, b'"""The plant of ', b"/* The plant of "), METRICS_ENDINGS: (b"# HELP ambid_",),
 }  # fmt: skip
 _STREAMED = ("json",)  # settings that take - for standard output
 

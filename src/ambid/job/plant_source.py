@@ -29,7 +29,6 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
-from ambid.control.law_files import comment_text
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.physics.law_magnet import BEARING_NUMBERS
@@ -436,3 +435,9 @@ def _variable(
 def _quoted(text: str) -> str:
     """Return an attribute's value; letters that XML cannot hold become spaces."""
     return quoteattr("".join(c if c.isprintable() else " " for c in text))
+
+
+def comment_text(name: str) -> str:
+    """Return a text, such as a name that somebody gave, that begins and ends no comment and no string."""
+    text = "".join(c if c.isprintable() and c not in '"\\' else " " for c in name)
+    return text.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").strip() or "a rig"

@@ -1,4 +1,4 @@
-"""A controller as a discrete-time state-space law, for what a PID cannot say: LQG, notches."""
+"""A controller as a discrete-time state-space law, for what a PID cannot say: notches, observers."""
 
 from __future__ import annotations
 

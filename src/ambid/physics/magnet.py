@@ -126,23 +126,12 @@ class SingleMagnet:
     1.9, 2.7), lambda = (k/x + leakage) i, so k_i < 0 and k_x < 0.
     """
 
-    k: float  # magnet constant in N m^2/A^2; see `from_geometry`
+    k: float  # magnet constant in N m^2/A^2: mu0 n^2 A (thesis eq. 2.7), half of it for a horseshoe's two gaps
     leakage: float = 0.0  # inductance in H that does not depend on the gap
 
     def __post_init__(self) -> None:
         _positive("k", self.k, "N m^2/A^2")
         _not_negative("leakage", self.leakage, "H")
-
-    @classmethod
-    def from_geometry(cls, *, turns: float, area: float, leakage: float = 0.0) -> SingleMagnet:
-        """Return the magnet with k = mu0 n^2 A (thesis eq. 2.7) of one gap of `area` m^2, and `leakage` in H.
-
-        A horseshoe closes its flux over two gaps in series: its reluctance is 2 d/(mu0 A) and k = mu0 n^2 A / 2 = 2 k',
-        with the k' = mu0 n^2 A / 4 of theory.md sec. 1.
-        """
-        _positive("turns", turns, "1")
-        _positive("area", area, "m^2")
-        return cls(k=MU_0 * turns**2 * area, leakage=leakage)
 
     @property
     def coenergy(self) -> CoEnergy:
@@ -193,10 +182,6 @@ class DifferentialPair:
         Pole half-angle alpha in rad.
     leakage : float
         Inductance of the axis (both coils) in H.
-    k_asym : float
-        Strengths are k (1 + k_asym) along +x, k (1 - k_asym) along -x; between -1 and 1.
-    bias_asym : float
-        Bias currents are i0 + bias_asym along +x, i0 - bias_asym along -x, in A.
     """
 
     turns: float
@@ -205,8 +190,6 @@ class DifferentialPair:
     gap: float
     half_angle: float = 0.0
     leakage: float = 0.0
-    k_asym: float = 0.0
-    bias_asym: float = 0.0
 
     def __post_init__(self) -> None:
         _positive("turns", self.turns, "1")
@@ -216,19 +199,12 @@ class DifferentialPair:
         _not_negative("leakage", self.leakage, "H")
         if not 0.0 <= self.half_angle < math.pi / 2:
             raise ModelError(f"half_angle is {self.half_angle} rad; it must be in [0, pi/2). Give it in rad")
-        if not (abs(self.k_asym) < 1.0 and abs(self.bias_asym) < self.bias):
-            raise ModelError(
-                f"k_asym is {self.k_asym} and bias_asym {self.bias_asym} A; both magnets must keep a strength and a"
-                " bias. Give k_asym between -1 and 1, and bias_asym below the bias"
-            )
 
     @property
     def coenergy(self) -> CoEnergy:
         """W' of both magnets as a function of x and of the differential current."""
         k = MU_0 * self.turns**2 * self.area / 2.0 * math.cos(self.half_angle)
-        more, less = k * (1.0 + self.k_asym), k * (1.0 - self.k_asym)
-        return CoEnergy(k_a=more, s_a=self.gap, k_b=less, s_b=self.gap, i0=self.bias, leakage=self.leakage,
-                        i0_asym=self.bias_asym)  # fmt: skip
+        return CoEnergy(k_a=k, s_a=self.gap, k_b=k, s_b=self.gap, i0=self.bias, leakage=self.leakage)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -238,8 +214,7 @@ class DifferentialPair:
     def holding_current(self, x: float, load: float) -> float:
         """Return the differential current that holds `load` in N (along +x) at `x` in m, with both coils conducting.
 
-        Solves a (i0 + j)^2 - b (i0 - j)^2 + load = 0 for j = i + bias_asym, with a = k_a/(2 (s0 - x)^2) and b = k_b/(2
-        (s0 + x)^2).
+        Solves a (i0 + i)^2 - b (i0 - i)^2 + load = 0 with a = k_a/(2 (s0 - x)^2) and b = k_b/(2 (s0 + x)^2).
 
         Parameters
         ----------
@@ -249,7 +224,7 @@ class DifferentialPair:
         Returns
         -------
         float
-            Differential current in A, abs(i + bias_asym) <= i0.
+            Differential current in A, abs(i) <= i0.
 
         Raises
         ------
@@ -268,7 +243,7 @@ class DifferentialPair:
                 f"a load of {load:g} N at {x:g} m needs more than the bias current of {w.i0:g} A; abs(i) must not"
                 " exceed the bias. Lower the load or raise the bias"
             )
-        return i - w.i0_asym
+        return i
 
 
 def _positive(name: str, value: float, unit: str) -> None:

@@ -233,9 +233,6 @@ class Shaft:
         Damping ratios of its bending modes, the last one for all that follow; none: undamped.
     elements : int
         About how many beam elements it is cut into; every step has at least one.
-    shear : bool
-        Whether shear is counted. Without it a section stays at right angles to the axis (Rayleigh), as in some older
-        tables.
 
     Raises
     ------
@@ -262,7 +259,6 @@ class Shaft:
     z: float = 0.0
     zeta: tuple[float, ...] = ()
     elements: int = ELEMENTS
-    shear: bool = True
 
     def __post_init__(self) -> None:
         if not self.steps:
@@ -354,9 +350,7 @@ class Shaft:
         for e, (a, b) in enumerate(pairwise(z)):
             step = self.steps[min(int(np.searchsorted(ends, (a + b) / 2.0)), len(self.steps) - 1)]
             s = slice(2 * e, 2 * e + 4)
-            for whole, part in zip(
-                (M, K, P), _element(step, step.material or self.material, b - a, self.shear), strict=True
-            ):
+            for whole, part in zip((M, K, P), _element(step, step.material or self.material, b - a), strict=True):
                 whole[s, s] += part
         for disc in self.discs:
             k = 2 * _node(z, disc.z)
@@ -366,14 +360,14 @@ class Shaft:
         return M, K, P
 
 
-def _element(step: Step, material: Material, length: float, shear: bool) -> tuple[Array, Array, Array]:
+def _element(step: Step, material: Material, length: float) -> tuple[Array, Array, Array]:
     """Mass (with rotary inertia), stiffness and polar-inertia matrix of a beam element, (4, 4)."""
     l, E, rho, nu = length, material.E, material.rho, material.nu  # noqa: E741
     area = math.pi * (step.diameter**2 - step.bore**2) / 4.0
     inertia = math.pi * (step.diameter**4 - step.bore**4) / 64.0
     hollow = (1.0 + (step.bore / step.diameter) ** 2) ** 2
     kappa = 6 * (1 + nu) * hollow / ((7 + 6 * nu) * hollow + (20 + 12 * nu) * (step.bore / step.diameter) ** 2)
-    f = 24.0 * (1 + nu) * inertia / (kappa * area * l**2) if shear else 0.0
+    f = 24.0 * (1 + nu) * inertia / (kappa * area * l**2)
     K = E * inertia / ((1 + f) * l**3) * np.array(
         [
             [12, 6 * l, -12, 6 * l],

@@ -335,17 +335,16 @@ def _magnet(plant: NonlinearPlant) -> RigMagnet | None:
     if not isinstance(w, CoEnergy):
         return None
     numbers, pair = law_numbers(w), w.k_a != 0.0
-    unequal = any(numbers[n] != 0.0 for n in ("k_asym", "i0_asym"))
     numbers["g"] = plant.gravity
     if math.isfinite(plant.eddy_pole):
         numbers["a"] = plant.eddy_pole
     if plant.stage.v_drop != 0.0:
         numbers |= {"v_drop": plant.stage.v_drop, "i_drop": plant.stage.i_drop}
-    left_out = (() if pair else ("i0",)) + (() if unequal else ("k_asym", "i0_asym"))
+    left_out = ("k_asym", "i0_asym") if pair else ("i0", "k_asym", "i0_asym")
     return RigMagnet(
         kind="pair" if pair else "single",
         gap="hyperbolic",
-        asymmetric=unequal if pair else None,
+        asymmetric=False if pair else None,
         rise=False,
         eddy=math.isfinite(plant.eddy_pole),
         parameters=tuple(

@@ -15,7 +15,7 @@ PACKAGE: Mapping[str, str] = {
     **dict.fromkeys(("greyest", "idgrey", "idnlgrey", "nlgreyest", "pem"), "ambid.identify(record, rig)"),
     **dict.fromkeys(("tfest", "spa", "etfe", "spafdr"), "ambid.frf(record, input, output, orders='nf=3,nb=2')"),
     **dict.fromkeys(("arx", "armax", "bj", "oe", "iv4", "n4sid", "moesp", "cva"), "ambid.fit(record, {0!r})"),
-    **dict.fromkeys(("ssest", "ssregest"), "ambid.fit(record, 'sspem')"),
+    **dict.fromkeys(("ssest", "ssregest"), "ambid.fit(record, 'pbsid')"),
     **dict.fromkeys(("nlarx", "idnlarx"), "ambid.fit(record, 'narx')"),
     **dict.fromkeys(("recursiveARX", "recursiveLS", "rarx"), "ambid.track(record, method='rls')"),
     **dict.fromkeys(("system_identification", "ident"), "ambid.fit(record, structure)"),

@@ -99,18 +99,14 @@ _JOBS = (
         criterion={"help": "all, or the parameter that matters.", "default": "all", "metavar": "NAME"},
         rate_hz={"help": "Sampling rate in Hz.", "shown": "the bench's"},
         force={"help": "Overwrite an existing record."}),
-    declare("design controller", "estimate rig out method goals limits spread form filters speeds_rpm "
-        "plants seed json plot report export strict force",
+    declare("design controller", "estimate rig out goals limits spread form filters speeds_rpm "
+        "plants seed json plot report strict force",
         estimate={"help": "What 'ambid identify @json' wrote.", "metavar": "ESTIMATE", "argument": True,
         "required": True},
         out={"help": "Write the rig with the new [loop].", "required": False, "metavar": "RIG"},
-        method={"long": "kind", "help": "pid: the present structure, tuned; lqg: a state-space law.",
-        "choices": (), "default": "pid", "metavar": "NAME"},
         spread={"help": "How far plants are drawn, such as delay=0.3; repeatable.", "shown": "see the documentation",
         "many": True, "kind": "text", "default": None, "metavar": "SOURCE=X"},
         seed={"help": "Seed of the plants."},
-        export={"long": "law", "help": "Write the law for other programs: .mat, .py (python-control) or .c (C "
-        "source)."},
         force={"help": "Overwrite an existing rig file."}),
     declare("export", "result out to anyway force",
         out={"help": "File to write: .mat, .py, .c, .h or .fmu."},

@@ -51,7 +51,6 @@ SETTINGS = (
     Setting("excitation_only", "switch", "", "Write only what is to be added to the controllers' outputs of a rotor."),
     Setting("experiment", "path", "E.json", "What 'ambid design experiment' promised: compare with the standard "
         "deviations."),
-    Setting("export", "path", "FILE", "Write the plant for other programs, as 'ambid export' does."),
     Setting("feedthrough", "switch", "", "With @state_space: include a direct path from input to output (D)."),
     Setting("filters", "whole", "N", "Filters around a rotor's lowest bending modes.", least=0, default=0),
     Setting("fix", "text", "NAME=NUMBER", "Fix a coefficient; repeatable.", many=True),

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypedDict, Unpack
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -84,6 +84,18 @@ class Scenario:
             )
         size = self.size if requested is None else requested
         return size if size is not None else self.own_size(bench) if self.own_size else 0.0
+
+    def start_for(self, duration_s: float, requested: float | None) -> float:
+        """Return when it begins, in s: as `requested`, else by its own part of the duration."""
+        if requested is not None and not self.size_is:
+            raise ModelError(f"scenario {self.name!r} has no beginning: nothing changes. Omit the time")
+        at = self.begins * duration_s if requested is None else requested
+        if not 0.0 <= at < duration_s:
+            raise ModelError(
+                f"scenario {self.name!r} begins at {at:g} s; the record runs from 0 to {duration_s:g} s. Give a time in"
+                " it"
+            )
+        return at
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -189,23 +201,19 @@ _CHUNK = 16384  # samples that are simulated at once
 _LARGEST = 10**8  # samples of one record: it has to fit into memory
 
 
-class Course(TypedDict, total=False):
-    """How a scenario runs; what is left out is the scenario's, or the bench's, own."""
-
-    duration_s: float | None  # length in s
-    rate_hz: float | None  # sampling rate in Hz
-    seed: int  # of excitation and noise; 0 if left out
-    # peak of the persistent excitation in the unit of the input; default what 0.4 of the limits allows before anything
-    # changes
-    amplitude: float | None
-    at_s: float | None  # when it begins, in s
-    size: float | None  # how much, as `Scenario.size_is` says
-    closed: bool | None  # closed or open loop; default closed, unless a rig says ``open_loop``
-    force: bool  # whether a loop that is predicted unstable is simulated too
-
-
 def simulate_scenario(
-    name: str | Scenario, bench: Preset | Rig, *, log_excitation: bool = False, **course: Unpack[Course]
+    name: str | Scenario,
+    bench: Preset | Rig,
+    *,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    seed: int = 0,
+    amplitude: float | None = None,
+    at_s: float | None = None,
+    size: float | None = None,
+    closed: bool | None = None,
+    force: bool = False,
+    log_excitation: bool = False,
 ) -> Simulation:
     """Simulate a scenario on the linear model of a bench.
 
@@ -215,10 +223,25 @@ def simulate_scenario(
         One of `scenario_names`.
     bench : Preset or Rig
         With a loop that holds it, also after the change.
+    duration_s : float, optional
+        Length in s; default the scenario's.
+    rate_hz : float, optional
+        Sampling rate in Hz; default the bench's.
+    seed : int
+        Of excitation and noise.
+    amplitude : float, optional
+        Peak of the persistent excitation in the unit of the input; default what 0.4 of the limits allows before
+        anything changes.
+    at_s : float, optional
+        When it begins, in s.
+    size : float, optional
+        How much, as `Scenario.size_is` says.
+    closed : bool, optional
+        Default closed, unless a rig says ``open_loop``.
+    force : bool
+        Simulate a loop that is predicted unstable too.
     log_excitation : bool
         Add a column ``excitation``.
-    **course
-        ``duration_s``, ``rate_hz``, ``seed``, ``amplitude``, ``at_s``, ``size`` and ``closed``, see `Course`.
 
     Returns
     -------
@@ -234,26 +257,53 @@ def simulate_scenario(
     RigError
         If a rig lacks what a simulation needs.
     """
-    run = _Run(name, bench, **course)
-    if run.n_samples > _LARGEST:
-        raise ModelError(
-            f"{run.duration_s:g} s at {run.bench.rate_hz:g} Hz is {run.n_samples:g} samples; one record takes"
-            f" {_LARGEST:g}. Make it shorter"
-        )
-    stretches, excitations = [], []
-    for first in range(0, run.n_samples, _CHUNK):
-        u = run.excitation(first, min(_CHUNK, run.n_samples - first))
-        stretches.append(run.running.advance(u))
-        excitations.append(u)
-    done = join(run.running, stretches, run.seed)
-    record = done.record.with_step(Step(name="scenario", settings=MappingProxyType(run.settings())))
+    what = scenario(name) if isinstance(name, str) else name
+    always = closed is None and isinstance(bench, Preset)
+    b = Bench.of(bench, rate_hz, True if always else closed)
+    duration = what.duration_s if duration_s is None else duration_s
+    n = _samples(duration, b.rate_hz)
+    if not force:
+        b.refuse_unstable()
+    at, much = what.start_for(duration, at_s), what.size_for(b, size)
+    u, peak = _excitation(what, b, n, amplitude, seed)
+    running = VaryingLoop(
+        b.plant, what.vary(b, at, much, duration), rate_hz=b.rate_hz, seed=seed, loop=b.loop, limits=b.limits,
+        noise=b.noise, operating_point=b.point,
+    )  # fmt: skip
+    done = join(running, [running.advance(u[k : k + _CHUNK]) for k in range(0, n, _CHUNK)], seed)
+    settings: dict[str, object] = {"name": what.name, "seed": seed, "amplitude": peak}
+    settings |= {"from_s": at, "size": much, "size_is": what.size_is} if what.size_is else {}
+    record = done.record.with_step(Step(name="scenario", settings=MappingProxyType(settings)))
     if log_excitation:
-        unit = run.bench.linear.model.units[run.bench.linear.model.inputs[0]]
-        logged = Channel(name="excitation", unit=unit, values=np.concatenate(excitations))
+        logged = Channel(name="excitation", unit=b.linear.model.units[b.linear.model.inputs[0]], values=u)
         record = replace(record, channels=(*record.channels, logged))
-    if run.bench.rig is not None:
-        record = as_columns(record, run.bench.rig, np.full(record.n_samples, run.bench.point.position))
+    if b.rig is not None:
+        record = as_columns(record, b.rig, np.full(record.n_samples, b.point.position))
     return replace(done, record=record)
+
+
+def _samples(duration_s: float, rate_hz: float) -> int:
+    if not (math.isfinite(rate_hz) and rate_hz > 0.0):
+        raise ModelError(f"rate_hz is {rate_hz}; it must be positive. Correct it")
+    count = duration_s * rate_hz
+    if not 1.0 <= count <= _LARGEST:
+        raise ModelError(
+            f"{duration_s:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to {_LARGEST:g}. Correct one"
+        )
+    return round(count)
+
+
+def _excitation(what: Scenario, bench: Bench, n: int, amplitude: float | None, seed: int) -> tuple[Array, float]:
+    """Return the excitation of n samples, and its peak."""
+    if amplitude is not None and not (math.isfinite(amplitude) and amplitude >= 0.0):
+        raise ModelError(f"amplitude is {amplitude}; it must be zero or positive. Correct it")
+    if not what.excited:
+        if amplitude:
+            raise ModelError(f"scenario {what.name!r} has no excitation. Omit the amplitude")
+        return np.zeros(n), 0.0
+    shape = one_period(bench, seed)
+    peak = amplitude_for(bench, shape, seed) if amplitude is None else amplitude
+    return np.resize(peak * shape, n), peak
 
 
 def truth_columns(record: Record) -> Mapping[str, Channel]:
@@ -272,69 +322,3 @@ def truth_columns(record: Record) -> Mapping[str, Channel]:
     """
     columns = {c.name.removeprefix(TRUE): c for c in record.channels if c.name.startswith(TRUE)}
     return MappingProxyType(columns)
-
-
-class _Run:
-    """A scenario with all its numbers settled, ready to go."""
-
-    def __init__(
-        self,
-        name: str | Scenario,
-        bench: Preset | Rig,
-        *,
-        duration_s: float | None = None,
-        rate_hz: float | None = None,
-        seed: int = 0,
-        amplitude: float | None = None,
-        at_s: float | None = None,
-        size: float | None = None,
-        closed: bool | None = None,
-        force: bool = False,
-    ) -> None:
-        self.scenario = scenario(name) if isinstance(name, str) else name
-        always = closed is None and isinstance(bench, Preset)
-        self.bench = b = Bench.of(bench, rate_hz, True if always else closed)
-        self.seed, self.duration_s = seed, self.scenario.duration_s if duration_s is None else duration_s
-        if not (math.isfinite(b.rate_hz) and b.rate_hz > 0.0):
-            raise ModelError(f"rate_hz is {b.rate_hz}; it must be positive. Correct it")
-        count = self.duration_s * b.rate_hz
-        if not (math.isfinite(count) and count >= 1.0):
-            raise ModelError(
-                f"{self.duration_s:g} s at {b.rate_hz:g} Hz is {count:g} samples; it must be at least one. Correct one"
-            )
-        self.n_samples = round(count)
-        if not force:
-            b.refuse_unstable()
-        if at_s is not None and not self.scenario.size_is:
-            raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Omit the time")
-        self.at_s = self.scenario.begins * self.duration_s if at_s is None else at_s
-        if not 0.0 <= self.at_s < self.duration_s:
-            raise ModelError(
-                f"scenario {self.scenario.name!r} begins at {self.at_s:g} s; the record runs from 0 to"
-                f" {self.duration_s:g} s. Give a time in it"
-            )
-        if amplitude is not None and not (math.isfinite(amplitude) and amplitude >= 0.0):
-            raise ModelError(f"amplitude is {amplitude}; it must be zero or positive. Correct it")
-        if amplitude and not self.scenario.excited:
-            raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Omit the amplitude")
-        self.size = self.scenario.size_for(b, size)
-        self.amplitude, self._period = 0.0, np.zeros(1)
-        if self.scenario.excited:
-            shape = one_period(b, self.seed)
-            self.amplitude = amplitude_for(b, shape, self.seed) if amplitude is None else amplitude
-            self._period = self.amplitude * shape
-        self.running = VaryingLoop(
-            b.plant, self.scenario.vary(b, self.at_s, self.size, self.duration_s), rate_hz=b.rate_hz, seed=seed,
-            loop=b.loop, limits=b.limits, noise=b.noise, operating_point=b.point,
-        )  # fmt: skip
-
-    def excitation(self, first: int, n: int) -> Array:
-        """Return the excitation of n samples."""
-        return np.asarray(self._period[(first + np.arange(n)) % self._period.size])
-
-    def settings(self) -> dict[str, object]:
-        """Return what the history says."""
-        settings: dict[str, object] = {"name": self.scenario.name, "seed": self.seed, "amplitude": self.amplitude}
-        if self.scenario.size_is:
-            settings |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
-        return settings

@@ -7,12 +7,10 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.model import pole_covariance
-from ambid.blackbox.state_space_search import sspem
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid
 from ambid.errors import EstimationError
 
-METHODS = {"n4sid": n4sid, "moesp": moesp, "cva": cva, "pbsid": pbsid, "sspem": sspem}
+METHODS = {"n4sid": n4sid, "moesp": moesp, "cva": cva, "pbsid": pbsid}
 
 
 @pytest.fixture(params=METHODS, name="method")
@@ -78,18 +76,8 @@ def test_inputs_that_nearly_move_together_have_honest_spreads(method, digits):
     assert np.max(np.abs(z)) > 0.1
 
 
-@pytest.mark.parametrize("name", ["cva", "pbsid", "sspem"])
+@pytest.mark.parametrize("name", ["cva", "pbsid"])
 def test_more_states_than_a_record_without_noise_shows_are_refused(name):
     u, _, _ = signals(4)
     with pytest.raises(EstimationError, match="identifies 1 state, not 2"):
         METHODS[name](given(np.r_[0.0, u[:-1]], u=u), {"n": 2})
-
-
-def test_prediction_error_without_noise_gives_the_plant_and_says_so():
-    u, _, _ = signals(5)
-    fit = sspem(given(lfilter([0, 1, 0.5], [1, -1.5, 0.7], u), u=u), {"n": 2})
-    poles = np.roots([1, -1.5, 0.7])
-    np.testing.assert_allclose(np.sort_complex(fit.model.poles()), np.sort_complex(poles), atol=1e-10)
-    np.testing.assert_allclose(pole_covariance(fit.model, fit.covariance), 0.0, atol=1e-18)
-    assert fit.status == "converged"
-    assert any("no noise" in w for w in fit.warnings)

@@ -129,10 +129,10 @@ def _plant(bench: Bench) -> Iterator[str]:
                 f"bench {bench.name!r} has a magnet with another law; the emulated bench has ideal magnets only. "
                 "Simulate it with ambid.simulation"
             )
-        if (pair and (w.k_a != w.k_b or w.i0_asym != 0.0)) or plant.stage != IDEAL or math.isfinite(plant.eddy_pole):
+        if plant.stage != IDEAL or math.isfinite(plant.eddy_pole):
             raise DeviceError(
-                f"bench {bench.name!r} has unequal magnets, an eddy pole or a lossy stage; the emulated bench has "
-                "none of them. Simulate it with ambid.simulation"
+                f"bench {bench.name!r} has an eddy pole or a lossy stage; the emulated bench has neither. "
+                "Simulate it with ambid.simulation"
             )
         yield f"kind {'differential' if pair else 'single'}"
         yield from _numbers({"m": plant.m, "R": plant.R, "c": plant.c, "k": w.k_b, "leakage": w.leakage})

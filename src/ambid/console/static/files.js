@@ -38,10 +38,8 @@ function chosenResult(file, detail) {
 function loopForm(file, detail) {
   const rigs = state.files.filter((f) => f.kind === "rig" && f.loop), host = el("div");
   const rig = el("select", {}, ...rigs.map((f) => el("option", { value: f.number }, f.name)));
-  const method = el("select", {}, el("option", { value: "pid" }, "PID, tuned"), el("option", { value: "lqg" }, "LQG"));
   const buttons = [["margins", "Margins"], ["design", "Design a better loop"]].map(([name, label]) => {
-    const spec = () => ({ job: name, estimate: file.number, rig: Number(rig.value), out: `${stem(file.name)}-${name}`,
-      ...(name === "design" && { method: method.value }) });
+    const spec = () => ({ job: name, estimate: file.number, rig: Number(rig.value), out: `${stem(file.name)}-${name}` });
     return el("button", { className: "go", onclick: async () => {
       allow(false); put(host);
       await job(spec(), (m) => { results(m, host); if (m.kind === "result") allow(true); }).catch(wrong(host));
@@ -50,8 +48,8 @@ function loopForm(file, detail) {
   });
   const allow = (on) => { for (const b of buttons) b.disabled = !on || state.read_only || !rigs.length; };
   allow(true);
-  detail.append(el("h2", {}, "Its loop"), el("div", { className: "bar" }, el("label", {}, "Rig with [loop] ", rig), buttons[0],
-    el("label", {}, "Method ", method), buttons[1]), el("p", { className: "hint" }, rigs.length
+  detail.append(el("h2", {}, "Its loop"), el("div", { className: "bar" }, el("label", {}, "Rig with [loop] ", rig), ...buttons),
+    el("p", { className: "hint" }, rigs.length
     ? "A design writes a rig with the new loop. The controller tries it where Live is started with it as 'Loop to try'."
     : "No rig of this folder has a [loop]: margins and design need one. Write it into the rig of this bench."), host);
 }
