@@ -313,6 +313,7 @@ def estimate_of(
         delay=dict.fromkeys(problem.model.inputs, delay),
         continuous=Continuous.of(plain.problem.model, theta),
         noise=_noise(plain),
+        coloured=_noise(fit) if colours_of(problem) else None,
         operating_point=means,
         fit={
             role: OutputFit(
@@ -353,6 +354,7 @@ def _noise(fit: Fit) -> NoiseModel:
         innovation_covariance=fit.covariance * np.outer(sc.output, sc.output),
         disturbance_sd=disturbance,
         sensor_sd=sensor,
+        colours=colours_of(problem),
     )
 
 
