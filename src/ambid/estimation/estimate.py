@@ -548,6 +548,9 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
         ``interrupted``. None: it was not needed.
     extended : tuple of str
         Causes that checks named and the model was extended by, whose sizes were estimated too.
+    bias_sd : Mapping[str, float]
+        Part of each estimated parameter's deviation that more data would not average out, SI, and by how much causes in
+        `extended` moved it, which a model without them does not hold.
     coloured : NoiseModel or None
         Noise with its coloured parts, where it has any: `noise` is the likeliest white one.
     """
@@ -575,6 +578,7 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     global_search: Mapping[str, object] | None = None
     extended: tuple[str, ...] = ()
+    bias_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     coloured: NoiseModel | None = None
 
     def dumps(self) -> str:

@@ -201,8 +201,8 @@ def words_of_start(
     warnings = dict.fromkeys([*first, *(r.text for r in estimate.reasons), *last])
     lacking = left_out(estimate) if isinstance(estimate, Estimate) else ()
     if lacking:
-        text = f"the start's model was extended by {', '.join(lacking)}, which tracking leaves out: it may move the"
-        warnings[f"{text} values by more than they are wide. Remove the cause, or identify part by part"] = None
+        text = f"the start's model was extended by {', '.join(lacking)}, which tracking leaves out: intervals are as"
+        warnings[f"{text} wide as that may move the values. Remove the cause, or identify part by part"] = None
     stated = {**{c.role: c.gain_sd for c in rig.channels}, "rate": rig.record.rate_sd}
     known = {**estimate.calibration_sd, **{source: sd for source, sd in stated.items() if sd is not None}}
     scale_sd = dict[str, float]()

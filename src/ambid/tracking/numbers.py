@@ -8,6 +8,7 @@ sin(angle), a = m e cos(phase), b = -m e sin(phase), held over a sample at its m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -47,7 +48,11 @@ def rate_of(estimate: Estimate) -> float:
 
 
 def left_out(estimate: Estimate) -> tuple[str, ...]:
-    """Return what the model of an estimate was extended by and tracking leaves out: all but coloured noise."""
+    """Return what the model of an estimate was extended by and tracking leaves out, where that moves a value by more
+    than it is wide: all but coloured noise.
+    """
+    if all(estimate.bias_sd.get(name, math.inf) <= estimate[name].sd for name in estimate.covariance_names):
+        return ()
     kept = ("slow_", "coloured_") if estimate.coloured else ()
     return tuple(cause for cause in estimate.extended if not cause.startswith(kept))
 
@@ -221,6 +226,7 @@ class TrackedNumbers:
     point: Array  # (n_inputs + n_outputs,), SI, operating point that is taken off the samples: inputs, then outputs
     innovation_covariance: Array  # (n_outputs, n_outputs), at the start, in scaled output units
     information_s: float  # length of the record behind the start, s
+    bias_sd: Array  # (p,), part of the deviations that more data would not average out
     # variance of weighted innovations' sums over what the model says of them: above 1 where the start estimate
     # explains its record only in part
     overdispersion: float = 1.0
@@ -311,6 +317,8 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
         innovation_covariance=noise_of.innovation_covariance / np.outer(scales.output, scales.output),
         information_s=float(str(estimate.record["samples"])) / problem.rate_hz,
         overdispersion=overdispersion_of(estimate),
+        bias_sd=np.array([estimate.bias_sd.get(name, 0.0) for g in groups for name in g.names])
+        / np.concatenate([g.magnitude for g in groups]),
         speed=top_speed,
         warnings=_poorly_known(estimate),
     )
