@@ -50,6 +50,7 @@ def test_coloured_noise_of_the_start_goes_on(tmp_path):
     assert found.lines[-1].error == pytest.approx(1.0, abs=0.05)
     for name, value in found.lines[-1].parameters.items():
         assert abs(value.value - truth[name]) < 4.0 * value.sd
+    assert start.validate(rest).verdict.word == "usable"  # a second record is judged with them, too
     white = ambid.track(rest, start=replace(start, coloured=None))
     assert white.totals.counts["disturbed"] > 5
 

@@ -581,6 +581,11 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     bias_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     coloured: NoiseModel | None = None
 
+    @property
+    def whole_noise(self) -> NoiseModel:
+        """Noise with its coloured parts, where it has any."""
+        return self.coloured or self.noise
+
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.
 

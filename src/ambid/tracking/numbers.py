@@ -294,7 +294,7 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
     """
     from scipy.linalg import block_diag
 
-    plain, noise_of = SensorGains(model(estimate.model)), estimate.coloured or estimate.noise
+    plain, noise_of = SensorGains(model(estimate.model)), estimate.whole_noise
     plant = Coloured(plain=plain, colours=noise_of.colours) if noise_of.colours else plain
     if estimate.status == "failed" or not estimate.covariance_names:
         raise EstimationError("the start estimate has no estimated parameters. Identify with free parameters first")
