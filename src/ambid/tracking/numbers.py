@@ -275,11 +275,6 @@ class TrackedNumbers:
         own = self.places("parameter")
         return np.asarray(q[own] * self.magnitude[own])
 
-    def physical_covariance(self, covariance: Array) -> Array:
-        """Return the physical parameters' covariance in SI units by that of q."""
-        own = self.places("parameter")
-        return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
-
     def vector(self, q: Array) -> Array:
         """Return q (p,) in the layout (problem.size,) of `PredictorProblem`, initial state zero."""
         out = np.zeros(self.problem.size)

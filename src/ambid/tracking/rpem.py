@@ -331,7 +331,8 @@ class PhysicalRpem:
     @property
     def covariance(self) -> Array:
         """Their covariance, SI, shape (n_parameters, n_parameters)."""
-        return self.numbers.physical_covariance(self.filter.covariance)
+        own, size = self.numbers.places("parameter"), self.numbers.magnitude
+        return np.asarray((self.filter.covariance * np.outer(size, size))[np.ix_(own, own)])
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state."""
