@@ -1,4 +1,4 @@
-"""A track whose start was extended by coloured noise: the predictor goes on with it."""
+"""Tracks whose start did not hold as it was: extended by coloured noise, which goes on, or failed for good reasons."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ import ambid
 from ambid.estimation.colours import Colour
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
+from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.signals import cut, multisine
 from ambid.simulation import LinearPlant, simulate
 from ambid.simulation.variation import Schedule, Variation
 from ambid.tracking.numbers import memory_of
 from tests.bearing.benches import SETTINGS
+from tests.tracking.starts import BEARING, bearing
 
 TAU_S, SECONDS = 0.01, 2.0
 
@@ -62,3 +64,21 @@ def test_modes_of_the_noise_do_not_count_as_memory():
     assert memory_of(F, (colour,)) == pytest.approx(10.0)
     turned = F[::-1, ::-1]  # a plant that forgets slowly beside noise that does not
     assert memory_of(turned, (colour,)) == pytest.approx(1e4)
+
+
+def test_more_data_average_out_no_bias_of_the_start():
+    """A position that holds 1 % of the current: what the start's failed checks imply stays in the intervals."""
+    sound, truth = bearing(40_000, 1), preset(BEARING).parameters
+    current, position = sound["current"].values, sound["position"].values
+    part = 0.01 * position.std() / current.std() * current
+    spoilt = [replace(c, values=c.values + part) if c.name == "position" else c for c in sound.channels]
+    record = replace(sound, channels=tuple(spoilt))
+    start, rest = ambid.identify(cut(record, 0.0, 1.0)), cut(record, 1.0, 2.0)
+    assert start.verdict.word == "caution"
+    last = ambid.track(rest, start=start).lines[-1].parameters
+    for name, value in last.items():
+        assert abs(value.value - truth[name]) < 3.0 * value.sd
+        assert value.sd > start.bias_sd[name]
+    bare = ambid.track(rest, start=replace(start, bias_sd={})).lines[-1].parameters
+    assert abs(bare["m"].value - truth["m"]) > 5.0 * bare["m"].sd
+    assert not any(ambid.identify(cut(sound, 0.0, 1.0)).bias_sd.values())
