@@ -266,15 +266,6 @@ class TrackedNumbers:
             return np.array([float(n == name) for n in self.names])
         return np.array([powers.get(n, 0.0) * at for n, at in zip(self.names, self.start, strict=True)])
 
-    def values(self, q: Array) -> dict[str, float]:
-        """Return the numbers q (p,) in SI units."""
-        return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
-
-    def physical(self, q: Array) -> Array:
-        """Return the physical parameters (n_parameters,) of the numbers q (p,), SI."""
-        own = self.places("parameter")
-        return np.asarray(q[own] * self.magnitude[own])
-
     def vector(self, q: Array) -> Array:
         """Return q (p,) in the layout (problem.size,) of `PredictorProblem`, initial state zero."""
         out = np.zeros(self.problem.size)

@@ -326,7 +326,7 @@ class PhysicalRpem:
     @property
     def estimate(self) -> Array:
         """Physical parameters, SI, shape (n_parameters,)."""
-        return self.numbers.physical(self.filter.q)
+        return np.asarray((self.filter.q * self.numbers.magnitude)[self.numbers.places("parameter")])
 
     @property
     def covariance(self) -> Array:
