@@ -106,7 +106,7 @@ def _joint_start(values: dict[str, float], spread: float) -> JointStart:
 
 def _start_of_rpem() -> dict[str, Any]:
     numbers = start_of(NAME)
-    found = {**preset(NAME).parameters, **numbers.values(numbers.start)}
+    found = {**preset(NAME).parameters, **dict(zip(numbers.names, numbers.start * numbers.magnitude, strict=True))}
     sd = np.sqrt(np.diag(numbers.covariance))[: len(PHYSICAL)]
     return _orders(_joint_start({k: found[k] for k in preset(NAME).parameters}, float(np.median(sd))))
 

@@ -318,9 +318,13 @@ def test_a_track_is_no_better_than_its_start(steady):
     def judged(**more):
         return track(steady[0], start=replace(start(2), **more), to_s=0.3)
 
-    assert judged().verdict.word == judged(extended=("slow_force",)).verdict.word == "usable"
-    for cause in ("cross_talk", "line (13 Hz)", "slow_force (15 Hz)", "r_drift (0.2 ohm)"):
-        (reason,) = judged(extended=("slow_force", cause)).verdict.reasons
+    own = start(2)
+    harmless, harmful = ({name: f * own[name].sd for name in own.covariance_names} for f in (0.5, 5.0))
+    assert judged().verdict.word == judged(extended=("line (13 Hz)",), bias_sd=harmless).verdict.word == "usable"
+    for cause in ("cross_talk", "line (13 Hz)", "r_drift (0.2 ohm)"):
+        found = judged(extended=(cause,), bias_sd=harmful)
+        assert all(found[name].sd > harmful[name] for name in harmful)
+        (reason,) = found.verdict.reasons
         assert (reason.check, reason.grave) == ("start", False)
         assert f"extended by {cause}, which tracking leaves out" in reason.text
         assert "Remove the cause" in reason.text

@@ -128,9 +128,8 @@ def test_each_damage_has_its_name_and_its_number_of_samples():
 def test_neighbours_in_wrong_order_are_put_right():
     stream = blocks(X)
     stream[10], stream[11] = stream[11], stream[10]
-    guard, out = fed(stream)
+    _, out = fed(stream)
     assert rejections(out) == []
-    assert guard.n_reordered == 1
     assert numbers(out).size == 6000
     assert sum(s.restart for s in stretches(out)) == 1
 

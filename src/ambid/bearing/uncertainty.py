@@ -90,12 +90,16 @@ class Uncertainty:
         """Return the covariance (n, n), SI, that goes with `standard_deviations`; if `robust`, as where the model is
         only near the truth: correlations from the scores, the larger of both deviations, plus the disagreement.
         """
+        away = self.away(robust=robust)
         if not robust:
-            return np.asarray(self.information + np.outer(self.bias, self.bias) + self.apart.T @ self.apart)
+            return np.asarray(self.information + away.T @ away)
         plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
         larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
-        away = np.vstack([self.disagreement, self.bias, self.apart])
         return np.asarray(self.robust * np.outer(larger, larger) + away.T @ away)
+
+    def away(self, *, robust: bool) -> Array:
+        """Return what of it more data would not average out, (n_ways, n), SI."""
+        return np.vstack([*([self.disagreement] if robust else []), self.bias, self.apart])
 
     def standard_deviations(self, *, robust: bool) -> Array:
         """Return deviations (n,), SI, from the information matrix, or `robust` ones, which are never smaller."""
@@ -313,6 +317,8 @@ def estimate_of(
         delay=dict.fromkeys(problem.model.inputs, delay),
         continuous=Continuous.of(plain.problem.model, theta),
         noise=_noise(plain),
+        coloured=_noise(fit) if colours_of(problem) else None,
+        bias_sd=dict(zip(known.names, np.sqrt(np.sum(known.away(robust=robust) ** 2, axis=0)).tolist(), strict=True)),
         operating_point=means,
         fit={
             role: OutputFit(
@@ -353,6 +359,7 @@ def _noise(fit: Fit) -> NoiseModel:
         innovation_covariance=fit.covariance * np.outer(sc.output, sc.output),
         disturbance_sd=disturbance,
         sensor_sd=sensor,
+        colours=colours_of(problem),
     )
 
 

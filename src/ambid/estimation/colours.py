@@ -13,7 +13,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.estimation.likelihood import Fit, Workspace, evaluate, search
 from ambid.estimation.linear import directions
-from ambid.estimation.predictor import PredictorProblem
+from ambid.estimation.predictor import PredictorProblem, Scales
 from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 
 _LEVEL = -2.0  # centre of the weak prior on the log level
@@ -166,6 +166,15 @@ def colours_of(problem: PredictorProblem) -> tuple[Colour, ...]:
     return problem.model.colours if isinstance(problem.model, Coloured) else ()
 
 
+def scaled_for(scales: Scales, plain: LinearModel, colours: Sequence[Colour]) -> Scales:
+    """Return a predictor's scales with those of colours beside the plain model, as of the white parts of sources."""
+    sources = [*plain.disturbances, *plain.outputs]
+    size = np.concatenate([scales.disturbance[: len(plain.disturbances)], scales.output])
+    own = size[[sources.index(c.source) for c in colours]]
+    state = np.append(scales.state, np.repeat(own, [c.order for c in colours]))
+    return replace(scales, state=state, disturbance=np.append(scales.disturbance, own))
+
+
 def with_colours(
     problem: PredictorProblem, vector: Array, colours: Sequence[Colour], over: float = 0.0
 ) -> tuple[PredictorProblem, Array]:
@@ -173,24 +182,18 @@ def with_colours(
     parts of their sources.
     """
     plain = problem.model.plain if isinstance(problem.model, Coloured) else problem.model
-    scales, end, white = problem.scales, len(problem.model.disturbances), len(plain.disturbances)
+    end, white = len(problem.model.disturbances), len(plain.disturbances)
     at = [(*plain.disturbances, *plain.outputs).index(c.source) for c in colours]
-    size = np.concatenate([scales.disturbance[:white], scales.output])[at]
     noise = vector[problem.slices["noise"]]
     levels = np.concatenate([noise[:white], [0.0], noise[end:]])[at] + over
-    orders = [c.order for c in colours]
     more = replace(
         problem, model=Coloured(plain=plain, colours=(*colours_of(problem), *colours)),
-        unsteady=problem.unsteady + len(at),
-        scales=replace(
-            scales, state=np.append(scales.state, np.repeat(size, orders)),
-            disturbance=np.append(scales.disturbance, size),
-        ),
+        unsteady=problem.unsteady + len(at), scales=scaled_for(problem.scales, plain, colours),
         noise_center=np.insert(problem.noise_center, end, np.full(len(at), _LEVEL)),
         extra=None if problem.extra is None else np.pad(problem.extra, ((0, 0), (0, len(at)))),
     )  # fmt: skip
     place = problem.slices["noise"].start + end
-    return more, np.append(np.insert(vector, place, levels), np.zeros(sum(orders)))
+    return more, np.append(np.insert(vector, place, levels), np.zeros(sum(c.order for c in colours)))
 
 
 def coloured(fit: Fit, choices: Sequence[Sequence[Colour]], tick: Callable[[], None] | None = None) -> Fit | None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError
+from ambid.estimation.colours import Colour
 from ambid.estimation.global_search import describe_search
 from ambid.estimation.parameters import EstimatedParameter as EstimatedParameter
 from ambid.estimation.parameters import Parametric as Parametric
@@ -496,6 +497,7 @@ class NoiseModel:
     innovation_covariance: Array  # (n_outputs, n_outputs)
     disturbance_sd: Mapping[str, float]  # held-over-a-sample disturbances and sensor noise; empty for a free gain
     sensor_sd: Mapping[str, float]
+    colours: tuple[Colour, ...] = ()  # coloured parts, whose states and disturbances come last
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -546,6 +548,11 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
         ``interrupted``. None: it was not needed.
     extended : tuple of str
         Causes that checks named and the model was extended by, whose sizes were estimated too.
+    bias_sd : Mapping[str, float]
+        Part of each estimated parameter's deviation that more data would not average out, SI, and by how much causes in
+        `extended` moved it, which a model without them does not hold.
+    coloured : NoiseModel or None
+        Noise with its coloured parts, where it has any: `noise` is the likeliest white one.
     """
 
     status: Literal["converged", "stalled", "failed"]
@@ -571,6 +578,13 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     global_search: Mapping[str, object] | None = None
     extended: tuple[str, ...] = ()
+    bias_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    coloured: NoiseModel | None = None
+
+    @property
+    def whole_noise(self) -> NoiseModel:
+        """Noise with its coloured parts, where it has any."""
+        return self.coloured or self.noise
 
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.

@@ -6,6 +6,7 @@ Read -> cut -> identify -> validate. Each arrow is one call below; what a step d
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -287,7 +288,10 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
         estimate = replace(estimate, extended=told(fit, taken))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
     worse = after & _OF_THE_MODEL or after - before - {"fixed_agree"} or len(after) >= len(before)
-    return first if worse else estimate
+    if worse or not taken:
+        return first if worse else estimate
+    moved = {name: math.hypot(sd, estimate[name].value - first[name].value) for name, sd in estimate.bias_sd.items()}
+    return replace(estimate, bias_sd=moved)
 
 
 def _judged(

@@ -26,7 +26,7 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import command, saved, setting
 from ambid.tracking.blocks import Replay, blocks_of
 from ambid.tracking.guard import ABSURD
-from ambid.tracking.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
+from ambid.tracking.numbers import Forcing, TrackedNumbers, forcing_of, left_out, tracked_numbers
 from ambid.tracking.rpem import PhysicalRpem
 
 _START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much
@@ -37,7 +37,6 @@ _LEAST = 1e-9  # part of an output that is not predicted
 _SAME = 1e-6  # relative difference of values that were written and read
 _FAR = 4.0  # standard deviations between a prior and a start that contradicts it
 _BLOCK_S = 0.01  # of the stream
-_HELD = ("slow_force", "slow_voltage")  # walks that extend an estimate, and the tracker's own offsets hold
 _ROWS = (".csv", ".csv.gz", ".h5", ".hdf5")  # formats whose rows are read with their damage
 
 
@@ -200,10 +199,10 @@ def words_of_start(
     """
     grave = {r.text: None for r in estimate.reasons if r.grave}
     warnings = dict.fromkeys([*first, *(r.text for r in estimate.reasons), *last])
-    lacking = [cause for cause in getattr(estimate, "extended", ()) if cause not in _HELD]
+    lacking = left_out(estimate) if isinstance(estimate, Estimate) else ()
     if lacking:
-        text = f"the start's model was extended by {', '.join(lacking)}, which tracking leaves out: it may move the"
-        warnings[f"{text} values by more than they are wide. Remove the cause, or identify part by part"] = None
+        text = f"the start's model was extended by {', '.join(lacking)}, which tracking leaves out: intervals are as"
+        warnings[f"{text} wide as that may move the values. Remove the cause, or identify part by part"] = None
     stated = {**{c.role: c.gain_sd for c in rig.channels}, "rate": rig.record.rate_sd}
     known = {**estimate.calibration_sd, **{source: sd for source, sd in stated.items() if sd is not None}}
     scale_sd = dict[str, float]()

@@ -355,8 +355,6 @@ class JointEkf(JointFilter):
     start : JointStart
     names : tuple of str
         Parameters, then offsets of the disturbances.
-    n_renewed : int
-        Times that the matrices were renewed at a new linearisation point.
     """
 
     def __init__(self, start: JointStart) -> None:
@@ -366,7 +364,6 @@ class JointEkf(JointFilter):
         self._at = self._scaled_parameters.copy()
         self._begun = self._relative_sd()
         self._M, self._dM = np.zeros((n, wide)), np.zeros((p, n, wide))
-        self.n_renewed = -1
         self._renew()
 
     @property
@@ -425,7 +422,6 @@ class JointEkf(JointFilter):
         self._M[:] = np.hstack([now.A, now.B, now.B_late, now.E])
         for j, d in enumerate(slopes):
             self._dM[j] = np.hstack([d.A, d.B, d.B_late, d.E])
-        self.n_renewed += 1
 
 
 class JointUkf(JointFilter):

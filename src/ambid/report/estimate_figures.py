@@ -78,7 +78,7 @@ class Evidence:
             measured=run.measured,
             predicted=run.predicted,
             simulated=run.simulated,
-            sd=np.sqrt(np.diag(self.estimate.noise.innovation_covariance)),
+            sd=np.sqrt(np.diag(self.estimate.whole_noise.innovation_covariance)),
             inputs=problem.u[problem.skip :],
             input_names=plant.inputs,
             input_units=tuple(plant.units[role] for role in plant.inputs),

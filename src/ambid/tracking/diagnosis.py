@@ -103,7 +103,6 @@ class Diagnosis:
         tell: Callable[[Event], None],
         *,
         t0: float,
-        false_alarms_per_hour: float,
     ) -> None:
         numbers, imperfect = rpem.numbers, rpem.numbers.overdispersion
         self._rpem, self._publication, self._tell, self._t0 = rpem, publication, tell, t0
@@ -115,7 +114,6 @@ class Diagnosis:
             hypotheses=[n for n in numbers.names if kinds[n] != "noise"],
             joints={cause: numbers.direction(cause) for cause in numbers.joints},
             block_s=rpem.block_s,
-            false_alarms_per_hour=false_alarms_per_hour,
             longest_s=LONGEST_S,
             overdispersion=imperfect,
             settle_s=_SETTLE_S if imperfect > 1.0 else 0.0,

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.colours import colours_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.tracking.kernels import advance, fold
-from ambid.tracking.numbers import TrackedNumbers
+from ambid.tracking.numbers import TrackedNumbers, memory_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,14 +172,13 @@ def linearise(numbers: TrackedNumbers, q: Array, near: Array | None = None) -> L
         )
         wide[:, -2, count], wide[:, -1, count + 1] = assembled.E[:, force], assembled.E[:, force]
         dM = wide
-    radius = float(np.abs(np.linalg.eigvals(M[:, :n])).max())
     return Linearisation(
         at=q.copy(),
         M=np.ascontiguousarray(M),
         D=np.ascontiguousarray(np.moveaxis(dM, 0, 1)),
         C=assembled.C,
         gain=assembled.gain,
-        memory=1.0 / (1.0 - radius),
+        memory=memory_of(M[:, :n], colours_of(problem)),
     )
 
 

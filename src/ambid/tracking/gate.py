@@ -366,7 +366,7 @@ def published(
     numbers: TrackedNumbers, accepted: Accepted, kind: Kind, fresh: Mapping[str, bool]
 ) -> dict[str, TrackedValue]:
     """Return the accepted numbers of one kind, SI."""
-    sd = np.sqrt(np.diag(accepted.covariance)) * numbers.magnitude
+    sd = np.sqrt(np.diag(accepted.covariance) + numbers.bias_sd**2) * numbers.magnitude
     values = accepted.values * numbers.magnitude
     return {
         numbers.names[j]: TrackedValue(

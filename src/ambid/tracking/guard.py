@@ -221,11 +221,6 @@ class StreamGuard:
         return sum(self._ledger.samples.values()) - self.n_missing
 
     @property
-    def n_reordered(self) -> int:
-        """Number of blocks that had been missed and came in time."""
-        return self._order.n_reordered
-
-    @property
     def n_waiting(self) -> int:
         """Number of blocks that wait for a missing or a confirming one."""
         return self._order.n_waiting

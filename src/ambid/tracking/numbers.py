@@ -8,6 +8,8 @@ sin(angle), a = m e cos(phase), b = -m e sin(phase), held over a sample at its m
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,7 +18,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate
+from ambid.estimation.colours import Colour, Coloured, scaled_for
+from ambid.estimation.estimate import Estimate, NoiseModel
 from ambid.estimation.predictor import NoiseForm, PredictorProblem, Scales, assemble, predictor_gain, scales_for
 from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.sensor_errors import SensorGains
@@ -25,6 +28,7 @@ from ambid.record import Record
 MEMORY_S = 0.02  # longest memory of the predictor: it is deaf for ten of them after a gap, and slow to show a change
 _LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
 _LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that explains its record
+_PART = 0.1  # of a mode, that is the plant's where it is one of the plant
 _GAIN_SD = 0.1  # relative, of an entry of the predictor gain
 
 
@@ -43,6 +47,16 @@ def rate_of(estimate: Estimate) -> float:
     return float(str(estimate.record["rate_hz"]))
 
 
+def left_out(estimate: Estimate) -> tuple[str, ...]:
+    """Return what the model of an estimate was extended by and tracking leaves out, where that moves a value by more
+    than it is wide: all but coloured noise.
+    """
+    if all(estimate.bias_sd.get(name, math.inf) <= estimate[name].sd for name in estimate.covariance_names):
+        return ()
+    kept = ("slow_", "coloured_") if estimate.coloured else ()
+    return tuple(cause for cause in estimate.extended if not cause.startswith(kept))
+
+
 def overdispersion_of(estimate: Estimate) -> float:
     """Return by how much the variance of weighted innovations' sums exceeds the model's; 1 where it explains its
     record.
@@ -52,11 +66,10 @@ def overdispersion_of(estimate: Estimate) -> float:
     return max(float(str(estimate.information.get("robust_over_information_sd", 1.0))) ** 2, 1.0)
 
 
-def noise_numbers(plant: SensorGains, estimate: Estimate, scales: Scales) -> NoiseNumbers:
+def noise_numbers(plant: LinearModel, estimate: Estimate, noise: NoiseModel, scales: Scales) -> NoiseNumbers:
     """Return the noise with which tracking begins: form "given", with a gain that forgets, where the estimate's own
     predictor does not forget soon enough.
     """
-    noise = estimate.noise
     gain = noise.gain * scales.output / scales.state[:, None]
     if noise.form == "gain":
         entries = gain.ravel()
@@ -68,14 +81,14 @@ def noise_numbers(plant: SensorGains, estimate: Estimate, scales: Scales) -> Noi
         disturbance = np.array([noise.disturbance_sd[d] for d in plant.disturbances]) / scales.disturbance
         with np.errstate(divide="ignore"):
             numbers = np.log(np.concatenate([disturbance, sensor[1:]]) / sensor[0])
-        if np.all(np.isfinite(numbers)) and _memory(A - gain @ C) <= longest:
+        if np.all(np.isfinite(numbers)) and memory_of(A - gain @ C, noise.colours) <= longest:
             sd = np.full(numbers.size, _LOG_LEVEL_SD * np.sqrt(overdispersion_of(estimate)))
             return NoiseNumbers(form="levels", numbers=numbers, sd=sd, gain=gain)
     nothing = np.zeros(0)
-    return NoiseNumbers(form="given", numbers=nothing, sd=nothing, gain=_bounded_gain(A, C, E, longest))
+    return NoiseNumbers(form="given", numbers=nothing, sd=nothing, gain=_bounded_gain(A, C, E, longest, noise.colours))
 
 
-def _discrete(plant: SensorGains, estimate: Estimate, scales: Scales) -> tuple[Array, Array, Array]:
+def _discrete(plant: LinearModel, estimate: Estimate, scales: Scales) -> tuple[Array, Array, Array]:
     """A, C and E of the sampled plant in scaled units."""
     at, _ = discretise(plant.matrices(estimate.values), 1.0 / rate_of(estimate))
     state = scales.state
@@ -86,13 +99,19 @@ def _discrete(plant: SensorGains, estimate: Estimate, scales: Scales) -> tuple[A
     )
 
 
-def _memory(F: Array) -> float:
-    """Memory of a predictor in samples."""
-    radius = float(np.abs(np.linalg.eigvals(F)).max())
-    return np.inf if radius >= 1.0 else 1.0 / (1.0 - radius)
+def memory_of(F: Array, colours: Sequence[Colour]) -> float:
+    """Return the memory of a predictor in samples, but for modes in which the plant takes no part (Pérez-Arriaga 1982):
+    coloured parts of the noise begin at rest, which is as near as any other state.
+    """
+    modes, V = np.linalg.eig(F)
+    radius = np.abs(modes)
+    if colours:
+        part = np.abs(V * np.linalg.inv(V).T)
+        radius = radius[part[: -sum(c.order for c in colours)].sum(axis=0) > _PART * part.sum(axis=0)]
+    return np.inf if np.abs(modes).max() >= 1.0 else 1.0 / (1.0 - float(radius.max()))
 
 
-def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
+def _bounded_gain(A: Array, C: Array, E: Array, longest: float, colours: Sequence[Colour]) -> Array:
     """Gain of a predictor that forgets soon enough, disturbances taken a little larger: without any, the initial state
     is remembered for ever. It costs innovation variance, about the number of states over the memory in samples.
     """
@@ -101,7 +120,7 @@ def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
             gain = predictor_gain(A, C, level**2 * E @ E.T, np.eye(C.shape[0])).K
         except np.linalg.LinAlgError:
             continue
-        if _memory(A - gain @ C) <= longest:
+        if memory_of(A - gain @ C, colours) <= longest:
             return gain
     raise EstimationError(
         "every predictor of this estimate is too slow to forget its start. Give a model whose states are observable"
@@ -207,6 +226,7 @@ class TrackedNumbers:
     point: Array  # (n_inputs + n_outputs,), SI, operating point that is taken off the samples: inputs, then outputs
     innovation_covariance: Array  # (n_outputs, n_outputs), at the start, in scaled output units
     information_s: float  # length of the record behind the start, s
+    bias_sd: Array  # (p,), part of the deviations that more data would not average out
     # variance of weighted innovations' sums over what the model says of them: above 1 where the start estimate
     # explains its record only in part
     overdispersion: float = 1.0
@@ -246,20 +266,6 @@ class TrackedNumbers:
             return np.array([float(n == name) for n in self.names])
         return np.array([powers.get(n, 0.0) * at for n, at in zip(self.names, self.start, strict=True)])
 
-    def values(self, q: Array) -> dict[str, float]:
-        """Return the numbers q (p,) in SI units."""
-        return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
-
-    def physical(self, q: Array) -> Array:
-        """Return the physical parameters (n_parameters,) of the numbers q (p,), SI."""
-        own = self.places("parameter")
-        return np.asarray(q[own] * self.magnitude[own])
-
-    def physical_covariance(self, covariance: Array) -> Array:
-        """Return the physical parameters' covariance in SI units by that of q."""
-        own = self.places("parameter")
-        return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
-
     def vector(self, q: Array) -> Array:
         """Return q (p,) in the layout (problem.size,) of `PredictorProblem`, initial state zero."""
         out = np.zeros(self.problem.size)
@@ -274,15 +280,16 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
     """
     from scipy.linalg import block_diag
 
-    plant = SensorGains(model(estimate.model))
+    plain, noise_of = SensorGains(model(estimate.model)), estimate.whole_noise
+    plant = Coloured(plain=plain, colours=noise_of.colours) if noise_of.colours else plain
     if estimate.status == "failed" or not estimate.covariance_names:
         raise EstimationError("the start estimate has no estimated parameters. Identify with free parameters first")
-    scales = _scales(plant, estimate)
-    noise = noise_numbers(plant, estimate, scales)
+    scales = scaled_for(_scales(plain, estimate, noise_of), plain, noise_of.colours)
+    noise = noise_numbers(plant, estimate, noise_of, scales)
     free = tuple(estimate.covariance_names)
     values, reference = estimate.values, plant.references(estimate.values)
-    sizes = [max(abs(values[k]), reference.get(k, 0.0)) or 1.0 for k in free] + [1.0] * len(plant.gains)
-    problem = _problem(plant, estimate, scales, noise, (*free, *plant.gains), np.array(sizes))
+    sizes = [max(abs(values[k]), reference.get(k, 0.0)) or 1.0 for k in free] + [1.0] * len(plain.gains)
+    problem = _problem(plant, estimate, scales, noise, (*free, *plain.gains), np.array(sizes), noise_of)
     groups = _groups(problem, estimate, noise, free, top_speed if synchronous else None)
     numbers = TrackedNumbers(
         names=tuple(name for g in groups for name in g.names),
@@ -293,9 +300,11 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
         covariance=block_diag(*(g.covariance for g in groups)),
         problem=problem,
         point=np.array([estimate.operating_point[role] for role in (*plant.inputs, *plant.outputs)]),
-        innovation_covariance=estimate.noise.innovation_covariance / np.outer(scales.output, scales.output),
+        innovation_covariance=noise_of.innovation_covariance / np.outer(scales.output, scales.output),
         information_s=float(str(estimate.record["samples"])) / problem.rate_hz,
         overdispersion=overdispersion_of(estimate),
+        bias_sd=np.array([estimate.bias_sd.get(name, 0.0) for g in groups for name in g.names])
+        / np.concatenate([g.magnitude for g in groups]),
         speed=top_speed,
         warnings=_poorly_known(estimate),
     )
@@ -317,7 +326,13 @@ class _Group:
 
 
 def _problem(
-    plant: SensorGains, estimate: Estimate, scales: Scales, noise: NoiseNumbers, names: tuple[str, ...], sizes: Array
+    plant: LinearModel,
+    estimate: Estimate,
+    scales: Scales,
+    noise: NoiseNumbers,
+    names: tuple[str, ...],
+    sizes: Array,
+    noise_of: NoiseModel,
 ) -> PredictorProblem:
     delay = estimate.delay[plant.inputs[0]]
     few = delay.samples + 3
@@ -338,6 +353,7 @@ def _problem(
         skip=delay.samples + 2,
         noise=noise.form,
         gain=noise.gain,
+        unsteady=len(noise_of.colours),
     )
 
 
@@ -350,9 +366,10 @@ def _groups(
 ) -> list[_Group]:
     """The tracked numbers, kind by kind, in the order of the predictor's vector."""
     plant, scales = problem.model, problem.scales
+    steady = plant.disturbances[: problem.slices["offset"].stop - problem.slices["offset"].start]
     n, count, specs = len(free), noise.numbers.size, {s.name: s.unit for s in plant.parameters}
     gains = problem.estimated[n:]
-    size, unit = problem.magnitude[:n], scales.disturbance
+    size, unit = problem.magnitude[:n], scales.disturbance[: len(steady)]
     groups = [
         _Group(
             kind="parameter", names=free, units=tuple(specs[k] for k in free), magnitude=size,
@@ -369,13 +386,13 @@ def _groups(
             magnitude=np.ones(count), start=noise.numbers, covariance=np.diag(noise.sd**2),
         ),
         _Group(
-            kind="offset", names=tuple(f"offset_{d}" for d in plant.disturbances),
-            units=tuple(plant.units[d] for d in plant.disturbances), magnitude=unit, start=np.zeros(unit.size),
+            kind="offset", names=tuple(f"offset_{d}" for d in steady),
+            units=tuple(plant.units[d] for d in steady), magnitude=unit, start=np.zeros(unit.size),
             covariance=_OFFSET_SD**2 * np.eye(unit.size),
         ),
     ]  # fmt: skip
-    if top_speed is not None and "force" in plant.disturbances:
-        size = np.full(2, unit[plant.disturbances.index("force")] / top_speed**2)
+    if top_speed is not None and "force" in steady:
+        size = np.full(2, unit[steady.index("force")] / top_speed**2)
         groups.append(
             _Group(
                 kind="unbalance", names=UNBALANCE, units=("kg m",) * 2, magnitude=size, start=np.zeros(2),
@@ -400,7 +417,7 @@ def _poorly_known(estimate: Estimate) -> tuple[str, ...]:
     )
 
 
-def _tracks_delay(plant: SensorGains, estimate: Estimate) -> bool:
+def _tracks_delay(plant: LinearModel, estimate: Estimate) -> bool:
     return bool(estimate.delay[plant.inputs[0]].sd)
 
 
@@ -417,9 +434,9 @@ def _delay(problem: PredictorProblem, estimate: Estimate) -> list[_Group]:
     ]  # fmt: skip
 
 
-def _scales(plant: LinearModel, estimate: Estimate) -> Scales:
+def _scales(plant: LinearModel, estimate: Estimate, noise: NoiseModel) -> Scales:
     """Scales from the innovations; an input is measured by what moves an output by about its innovation in a sample."""
-    outputs = np.sqrt(np.diag(estimate.noise.innovation_covariance))
+    outputs = np.sqrt(np.diag(noise.innovation_covariance))
     rate = rate_of(estimate)
     scales = scales_for(plant, estimate.values, np.ones(len(plant.inputs)), outputs, rate)
     discrete, _ = discretise(plant.matrices(estimate.values), 1.0 / rate)

@@ -136,7 +136,7 @@ _LEAP_S = 1.0  # a number that leads by more is doubted where no clock says that
 class BlockOrder:
     """Places blocks, each sample once, later than all before; `depth`: blocks that may wait for a missing one; `place`:
     given each part in order, less what had been passed. `next`: number wanted next; `offset`: of the stream's numbers
-    against the acquisition's; `n_reordered`: missed blocks that came in time.
+    against the acquisition's.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class BlockOrder:
         self._tail: Part | None = None  # the last one placed
         self._old: Part | None = None  # the last one whose numbers had passed
         self._old_samples = 0  # in sequence up to that
-        self.next = self.offset = self.n_reordered = 0
+        self.next = self.offset = 0
 
     @property
     def n_waiting(self) -> int:
@@ -177,7 +177,6 @@ class BlockOrder:
                 self._doubtful = None
                 low, high = sorted((doubtful, part), key=lambda each: each.first)
                 self._start(low)
-                self.n_reordered += low is part
                 self._line_up(low)
                 self._line_up(high)
             elif doubtful.first == part.first and doubtful.size == part.size:
@@ -292,7 +291,6 @@ class BlockOrder:
             while len(self._waiting) > self._depth:
                 self._release()
         else:
-            self.n_reordered += bool(self._waiting)
             self._place(part)
         while self._waiting and not self._missing_before(self._waiting[0]):
             self._place(self._waiting.pop(0))

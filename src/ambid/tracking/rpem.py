@@ -31,8 +31,7 @@ Flags = NDArray[np.bool_]
 
 class ParameterFilter:
     """Estimate `q` (p,) and covariance of the tracked numbers, from `start` and a positive definite one; `positive`:
-    which stay so, default none; `active`: which evidence may move, and which may walk; `n_shortened`: steps shortened
-    because a positive number would have lost more than half.
+    which stay so, default none, by steps that take at most half; `active`: which evidence may move, and which may walk.
     """
 
     def __init__(self, start: Array, covariance: Array, positive: Flags | None = None) -> None:
@@ -40,7 +39,6 @@ class ParameterFilter:
         self._scratch = np.zeros((start.size + 2, start.size))
         self.active = np.ones(start.size, dtype=np.bool_)
         self._positive = np.zeros(start.size, dtype=np.bool_) if positive is None else positive
-        self.n_shortened = 0
 
     @property
     def covariance(self) -> Array:
@@ -62,10 +60,9 @@ class ParameterFilter:
         """Take in a block's evidence; return the residual's squared length before, chi-squared with p degrees of
         freedom if model and covariance are right.
         """
-        misfit, part = absorb(
+        misfit, _ = absorb(
             self.q, self._F, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise, self._scratch
         )
-        self.n_shortened += part < 1.0
         return float(misfit)
 
     def far(self, at: Array, J: Array, curved: Array, most: float) -> bool:
@@ -329,12 +326,13 @@ class PhysicalRpem:
     @property
     def estimate(self) -> Array:
         """Physical parameters, SI, shape (n_parameters,)."""
-        return self.numbers.physical(self.filter.q)
+        return np.asarray((self.filter.q * self.numbers.magnitude)[self.numbers.places("parameter")])
 
     @property
     def covariance(self) -> Array:
         """Their covariance, SI, shape (n_parameters, n_parameters)."""
-        return self.numbers.physical_covariance(self.filter.covariance)
+        own, size = self.numbers.places("parameter"), self.numbers.magnitude
+        return np.asarray((self.filter.covariance * np.outer(size, size))[np.ix_(own, own)])
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state."""

@@ -38,7 +38,6 @@ class Supervisor:
         *,
         limit: float = 1.5,
         operator: Operator | None = None,
-        false_alarms_per_hour: float = 0.05,
         t0: float = 0.0,
         listener: Callable[[Event], None] = lambda _: None,
     ) -> None:
@@ -56,7 +55,7 @@ class Supervisor:
         self.level = ErrorLevel(limit, max(_RELEASE * limit, min(1.1, limit)), max(2, round(_LEVEL_S / block_s)))
         self._tell = listener
         self.publication = Publication(rpem, self.operator, listener, t0)
-        self.diagnosis = Diagnosis(rpem, self.publication, listener, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
+        self.diagnosis = Diagnosis(rpem, self.publication, listener, t0=t0)
         self._silent, self._heard, self._deaf_s = False, 0, 0.0  # no evidence since when: sample, and s
         self._spoken = False  # whether there has been any
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed

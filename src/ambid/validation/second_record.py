@@ -11,6 +11,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.errors import EstimationError, counted
+from ambid.estimation.colours import Coloured, scaled_for
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.likelihood import (
     Fit,
@@ -90,9 +91,11 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
             raise EstimationError(
                 f"channel {role!r} is constant in the whole record, which cannot test an estimate. Check it"
             )
+    noise = estimate.whole_noise
     scales = scales_for(plant, estimate.values, np.std(u, axis=0), noise_floor(y), signals.rate_hz)
+    scales = scaled_for(scales, plant, noise.colours)
     problem = PredictorProblem(
-        model=plant,
+        model=Coloured(plain=plant, colours=noise.colours) if noise.colours else plant,
         rate_hz=signals.rate_hz,
         u=u,
         y=y,
@@ -106,7 +109,8 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
         lag=delay.fraction,
         skip=skip,
         noise="given",
-        gain=estimate.noise.gain * scales.output / scales.state[:, None],
+        gain=noise.gain * scales.output / scales.state[:, None],
+        unsteady=len(noise.colours),
     )
     fit = search(problem, np.zeros(problem.size))
     if fit.status == "failed":
@@ -152,7 +156,7 @@ def _judged(estimate: Estimate, signals: Signals) -> dict[str, object]:
     one_step = fit_of(run.innovations, run.measured)
     simulation = None if run.simulated is None else fit_of(run.measured - run.simulated, run.measured)
     rms = np.sqrt(np.mean(run.innovations**2, axis=0))
-    before = np.sqrt(np.diag(estimate.noise.innovation_covariance))
+    before = np.sqrt(np.diag(estimate.whole_noise.innovation_covariance))
     roles = model(estimate.model).outputs
     horizons = [k for k in _HORIZONS if k < run.measured.shape[0] // 2]
     errors = {k: prediction_error(run.fit, k) for k in horizons}
@@ -197,7 +201,7 @@ def consistency_check(ratios: Mapping[str, float], where: str) -> Check:
 def _expected_sd(run: Replay, estimate: Estimate, horizons: list[int]) -> dict[int, Array]:
     """Standard deviations of the errors ahead that the estimate expects, with the innovations of its own record."""
     scale = run.fit.problem.scales.output
-    own = replace(run.fit, covariance=estimate.noise.innovation_covariance / np.outer(scale, scale))
+    own = replace(run.fit, covariance=estimate.whole_noise.innovation_covariance / np.outer(scale, scale))
     return {k: expected_prediction_sd(own, k) for k in horizons}
 
 
