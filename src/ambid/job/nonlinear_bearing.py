@@ -4,7 +4,6 @@ magnet (not the same data or channel twice, the stage off, a held rotor that mov
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,9 +31,9 @@ from ambid.record import Record
 from ambid.rig import Rig, RigMagnet
 from ambid.settings.caller import setting
 from ambid.validation.nonlinear_bearing import (
-    WhitenessTest,
     agreement,
     agreement_check,
+    innovation_sd,
     record_facts,
     whiteness,
     whiteness_checks,
@@ -274,8 +273,8 @@ def judge_bearing(
     """
     problem, names = fit.problem, _names(fit)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
-        tests = list(threads.map(lambda r: whiteness(fit, r), range(len(problem.records))))
-    residuals = whiteness_checks(tests, names)
+        tests = list(threads.map(partial(whiteness, fit), range(len(names)), names if len(names) > 1 else [""]))
+    residuals = whiteness_checks(tests)
     alone = agreement(fit, spread, alone=True)
     residuals |= {"records_agree": agreement_check(alone)} if alone.strides else {}
     robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
@@ -298,7 +297,7 @@ def judge_bearing(
         law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in readings),
         parameters=parameters, covariance_names=spread.names, covariance=spread.covariance(robust=wide),
         covariance_method="robust" if wide else "information", delay=delays,
-        noise=noise, fit=_fits(fit, tests, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
+        noise=noise, fit=_fits(fit, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
         usual=_between(*np.quantile(moving, (0.025, 0.975), axis=0)),
         operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),
         hull=_hull(moving), coil_hull=_hull(points), criterion=fit.criterion,
@@ -320,14 +319,13 @@ def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict
     }
 
 
-def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
+def _fits(fit: BearingFit, names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
     fits: dict[str, dict[str, OutputFit]] = {}
-    for name, record, test in zip(names, fit.problem.records, tests, strict=True):
-        spread = record.kept.std(axis=0).tolist()
+    for r, (name, record) in enumerate(zip(names, fit.problem.records, strict=True)):
+        spread = dict(zip(_ROLES, record.kept.std(axis=0).tolist(), strict=True))
         fits[name] = {
-            role: OutputFit(one_step=1.0 - sd / spread[c], simulation=None, innovation_sd=sd)
-            for c, (role, sd) in enumerate(zip(_ROLES, test.innovation_sd, strict=True))
-            if math.isfinite(sd)
+            role: OutputFit(one_step=1.0 - sd / spread[role], simulation=None, innovation_sd=sd)
+            for role, sd in innovation_sd(fit, r).items()
         }
     return fits
 
@@ -346,9 +344,7 @@ def _names(fit: BearingFit) -> list[str]:
 
 def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) -> tuple[EstimatedParameter, ...]:
     """Return every number that acts."""
-    law, values, parameters = fit.problem.law, fit.problem.values(fit.vector), list[EstimatedParameter]()
-    moves = _moves(fit)
-    sds = np.sqrt(np.diag(spread.covariance(robust=robust)))
+    law, values, numbers = fit.problem.law, fit.problem.values(fit.vector), fit.problem.numbers
     acts = {
         "sigma": law.saturation,
         "L_rise": law.rise,
@@ -358,24 +354,22 @@ def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) ->
         "tau": fit.problem.drift,
     }
     acts |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
-    drop = values["v_drop"] != 0.0 or any(n.name == "v_drop" and n.estimated for n in fit.problem.numbers)
+    drop = values["v_drop"] != 0.0 or any(n.name == "v_drop" and n.estimated for n in numbers)
     acts |= dict.fromkeys(("v_drop", "i_drop"), drop)
-    for n in fit.problem.numbers:
-        if not acts.get(n.name, True):
-            continue
-        j = spread.names.index(n.name) if n.estimated else -1
-        sd, value = float(sds[j]) if n.estimated else 0.0, values[n.name]
-        prior = np.isfinite(n.prior_sd)
-        size = max(n.magnitude, abs(value)) if n.signed else value
-        share = None
-        if prior and n.estimated:
-            share = float(np.clip(1.0 - spread.information[j, j] / n.prior_sd**2, 0.0, 1.0))
-        role: Literal["free", "fixed", "prior"] = "fixed" if not n.estimated else "prior" if prior else "free"
-        identifiable = not n.estimated or sd < WEAK * abs(size) or sd * moves.get(n.name, np.inf) < WEAK
-        parameters.append(EstimatedParameter(
-            name=n.name, unit=UNITS[n.name], value=value, sd=sd, ci95=(value - 1.96 * sd, value + 1.96 * sd),
-            role=role, identifiable=identifiable, data_share=share,
-        ))  # fmt: skip
+    both = np.diag(spread.information), np.sqrt(np.diag(spread.covariance(robust=robust)))
+    own, sd = (dict(zip(spread.names, x.tolist(), strict=True)) for x in both)
+    moves = _moves(fit)
+    size = {n.name: max(n.magnitude, abs(values[n.name])) if n.signed else values[n.name] for n in numbers}
+    seen = {n: x < WEAK * abs(size[n]) or x * moves.get(n, np.inf) < WEAK for n, x in sd.items()}
+    parameters = list[EstimatedParameter]()
+    for n in (n for n in numbers if acts.get(n.name, True)):
+        prior = n.estimated and np.isfinite(n.prior_sd)
+        known = Parameter(
+            name=n.name, unit=UNITS[n.name], value=n.value, sd=n.prior_sd if prior else None,
+            role="prior" if prior else "free" if n.estimated else "fixed",
+        )  # fmt: skip
+        alone = {n.name: float(max(1.0 / own[n.name] - 1.0 / n.prior_sd**2, 1e-300) ** -0.5)} if prior else None
+        parameters.append(EstimatedParameter.of(known, values, sd, seen, alone))
     return tuple(parameters)
 
 
@@ -396,7 +390,6 @@ def _moves(fit: BearingFit) -> dict[str, float]:
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
-
     hidden = [p.name for p in parameters if not p.identifiable]
     detail = "every estimated parameter is identifiable" if not hidden else (
         f"not identifiable from these records: {', '.join(hidden)} (relative standard deviation above 25 %). Fix them, "
