@@ -65,6 +65,7 @@ class BearingRecord:
     # (n_samples,), bool, or None, samples that are left out, such as those of a rotor that lies on a stop; the
     # predictor begins anew after them. None: none.
     cut: NDArray[np.bool_] | None = None
+    push: Array | None = None  # (n_samples,), m/s^2, or None, acceleration by a known force during each sample
 
     @property
     def parts(self) -> tuple[tuple[int, int], ...]:
@@ -86,7 +87,7 @@ class BearingRecord:
 
     def part(self, samples: slice) -> BearingRecord:
         """Return some samples in a row of the record."""
-        names = [n for n in ("u", "loose", "y", "valid", "knock", "cut") if getattr(self, n) is not None]
+        names = [n for n in ("u", "loose", "y", "valid", "knock", "cut", "push") if getattr(self, n) is not None]
         return replace(self, **{name: getattr(self, name)[samples] for name in names})
 
 

@@ -83,7 +83,7 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     eddy, drift : bool
         Whether the force has a pole a/(s + a), and whether a force and a voltage may drift.
     extended : tuple of str
-        What the model was extended by because it pays: drift.
+        What the model was extended by: drift because it pays; lines and a drift of R that the innovations showed.
     records : tuple of Mapping
         ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` of each.
     parameters : tuple of EstimatedParameter

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_estimate import PARTS
-from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, bearing_moves
+from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, bearing_moves, uncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, BearingRecord, touching, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError, counted
@@ -30,7 +30,10 @@ from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig, RigMagnet
 from ambid.settings.caller import setting
+from ambid.validation.bearing_causes import bearing_causes, bearing_look, extended_bearing
+from ambid.validation.causes import Cause, causes_check, named_bias, told_of, worse
 from ambid.validation.nonlinear_bearing import (
+    Whiteness,
     agreement,
     agreement_check,
     innovation_sd,
@@ -46,6 +49,7 @@ _REVERSED = 0.2  # largest current backwards over that forwards from which two m
 _SAME = 1e-9  # part of a channel's spread that another one leaves over, at or below which both are the same signal
 _ROCKS = 0.25  # spread of a held position over that of the moving ones from which it is told
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
+_CAUSES = 6  # by which a model is extended
 _ROLES = ("position", "current")
 _OFFSETS = {"voltage": "v_offset", "current": "i_offset", "position": "x_offset"}
 
@@ -265,13 +269,26 @@ def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:
     return replace(one, warnings=(*one.warnings, warning))
 
 
-def judge_bearing(
-    fit: BearingFit, spread: BearingUncertainty, readings: Sequence[TakenRecord], rig: Rig
-) -> NonlinearBearingEstimate:
-    """Check a fit that has not failed, with its `spread`, on its own `readings`; estimate without validation, timings
-    and rig.
+def grown_bearing(fit: BearingFit, readings: Sequence[TakenRecord], rig: Rig) -> NonlinearBearingEstimate:
+    """Judge a fit that has not failed on its own `readings`, and, while a check names a cause that changes in time and
+    that the model can take in, one with it; see `identification`. Estimate without validation, timings and rig.
     """
-    problem, names = fit.problem, _names(fit)
+    estimate, found = _judged(fit, readings, rig)
+    first, given = estimate, rig.channel("voltage").delay != "auto"
+    taken: tuple[Cause, ...] = ()
+    while len(taken) < _CAUSES and not estimate.checks["causes"].passed:
+        more = extended_bearing(fit, found, readings[0].record, taken, delay_given=given)
+        if more is None:
+            break
+        fit, taken = more
+        estimate, found = _judged(fit, readings, rig)
+        estimate = replace(estimate, extended=tuple(dict.fromkeys([*estimate.extended, *map(told_of, taken)])))
+    return first if worse(first.checks, estimate.checks) else estimate
+
+
+def _judged(fit: BearingFit, readings: Sequence[TakenRecord], rig: Rig) -> tuple[NonlinearBearingEstimate, list[Cause]]:
+    """Check a fit on its own `readings`; return the estimate and the causes that innovations may have."""
+    problem, names, spread = fit.problem, _names(fit), uncertainty(fit)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
         tests = list(threads.map(partial(whiteness, fit), range(len(names)), names if len(names) > 1 else [""]))
     residuals = whiteness_checks(tests)
@@ -279,11 +296,15 @@ def judge_bearing(
     residuals |= {"records_agree": agreement_check(alone)} if alone.strides else {}
     robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
     moves = [alone.beyond_chance(), agreement(fit, spread, alone=False).beyond_chance()] if robust else []
-    told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig)
-    spread = replace(spread, disagreement=np.vstack([*moves, contradicted]))
-    wide = robust or len(contradicted) > 0
+    told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig, robust=robust)
+    given = rig.channel("voltage").delay != "auto"
+    found, named, biased = _causes(
+        fit, spread, {**told, **residuals}, tests, readings, robust=robust, delay_given=given
+    )
+    spread = replace(spread, disagreement=np.vstack([*moves, contradicted, biased]))
+    wide = robust or bool(np.any(spread.disagreement))
     parameters = _parameters(fit, spread, robust=wide)
-    checks = {**told, **residuals, "identifiable": _shown(parameters)} | _gravity(fit) | _law(fit)
+    checks = {**told, **residuals, **named, "identifiable": _shown(parameters)} | _gravity(fit) | _law(fit)
     noise = {
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
         for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
@@ -291,7 +312,7 @@ def judge_bearing(
     points = np.concatenate([r.kept for r in problem.records])
     moving = np.concatenate([r.kept for r in problem.records if not r.held])
     changed = tuple(w for t in readings for w in t.warnings)
-    delays = _delays(fit, spread, given=rig.channel("voltage").delay != "auto")
+    delays = _delays(fit, spread, given=given)
     estimate = NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
         law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in readings),
@@ -305,9 +326,8 @@ def judge_bearing(
         extended=("drift",) * (problem.drift and not (rig.magnet is not None and rig.magnet.drift)),
         warnings=_warnings(fit, checks, robust=robust) + changed,
     )  # fmt: skip
-    return calibrated(
-        estimate, rig, rig.plant, estimate.values, spread.names, partial(bearing_moves, fit), offsets=_OFFSETS
-    )
+    moves_of = partial(bearing_moves, fit)
+    return calibrated(estimate, rig, rig.plant, estimate.values, spread.names, moves_of, offsets=_OFFSETS), found
 
 
 def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
@@ -317,6 +337,26 @@ def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict
         )
         for rate in fit.problem.delays
     }
+
+
+def _causes(
+    fit: BearingFit, spread: BearingUncertainty, checks: Mapping[str, Check], tests: Sequence[Whiteness],
+    readings: Sequence[TakenRecord], *, robust: bool, delay_given: bool,
+) -> tuple[list[Cause], dict[str, Check], Array]:  # fmt: skip
+    """Return the causes that the innovations of the moving record which fits worst may have, judged, and how far those
+    seen, and bands left out where checks failed (`robust`), move the numbers, (n_moves, n), SI.
+    """
+    worst = min((r for r, x in enumerate(fit.problem.records) if not x.held), key=lambda r: tests[r].p)
+    look, own = bearing_look(fit, worst), np.sqrt(np.diag(spread.information))
+    if look is None:
+        return [], {"causes": Check(passed=True, detail="no cause could be looked for")}, np.zeros((0, own.size))
+    found, judged = list[Cause](), dict[str, Check]()
+    for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
+        found = bearing_causes(look, thorough=thorough, delay_given=delay_given)
+        judged = causes_check(found, checks, own, robust=robust, record=readings[worst].bench)
+        if judged["causes"].passed:
+            break
+    return found, judged, np.vstack([named_bias(found, np.zeros(own.size)), *([look.bands()] if robust else [])])
 
 
 def _fits(fit: BearingFit, names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:

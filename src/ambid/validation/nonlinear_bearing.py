@@ -9,15 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.columns import check_lag
 from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, run, search, sweep, uncertainty
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
+from ambid.bearing.multistart import Signals
 from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.record import Record
 from ambid.rig import Rig
-from ambid.validation.facts import facts, ohm, sampling
+from ambid.validation.facts import facts, ohm, resolution_check, sampling, signal_checks
 from ambid.validation.physical import Agreement
 from ambid.validation.residuals import (
     P_LEAST,
@@ -256,11 +258,13 @@ def agreement(fit: BearingFit, spread: BearingUncertainty, *, alone: bool) -> Ag
 
 
 def record_facts(
-    fit: BearingFit, spread: BearingUncertainty, benches: Sequence[Record], names: Sequence[str], rig: Rig
-) -> tuple[dict[str, Check], Array]:
+    fit: BearingFit, spread: BearingUncertainty, benches: Sequence[Record], names: Sequence[str], rig: Rig, *,
+    robust: bool = False,
+) -> tuple[dict[str, Check], Array]:  # fmt: skip
     """Compare what each record says by itself with the estimate, and return the worst of each check, and how far R and
     the offset of the voltage move where the means contradict them, (n_contradicting, n), SI. `benches`: channels by
-    role; `names`: of the records. Of a record that was cut its longest part speaks, with the voltage that counts.
+    role; `names`: of the records; `robust`: whether other checks failed. Of a record that was cut its longest part
+    speaks, with the voltage that counts.
 
     A rig that gives an offset or a drop of the stage explains the means by it, and a stage that is off has none.
     """
@@ -270,13 +274,17 @@ def record_facts(
     explained = rig.magnet is not None and any(rig.magnet.known(n) is not None for n in _STAGE)
     found: dict[str, list[tuple[str, Check]]] = {}
     moves = list[list[float]]()
-    for record, bench, name in zip(fit.problem.records, benches, names, strict=True):
-        roles = ("voltage", "current") if record.held else ("voltage", "current", "position")
+    for r, (record, bench, name) in enumerate(zip(fit.problem.records, benches, names, strict=True)):
+        outputs = ("current",) if record.held else _ROLES
+        roles = ("voltage", *outputs)
         first, end = max(record.parts, key=lambda part: part[1] - part[0])
         values_of = {role: record.u if role == "voltage" else bench[role].values for role in roles}
         own = tuple(replace(bench[role], values=x[first:end]) for role, x in values_of.items())
         bench = replace(bench, channels=own, start_s=bench.start_s + first / bench.rate_hz)
-        checks = facts(bench, rig)
+        known = outputs if np.any(record.loose > 0.0) else roles  # a stage that is off is no limit
+        checks = {**facts(bench, rig), **signal_checks(bench[[*known]], outputs)}
+        if robust:
+            checks["resolution"] = resolution_check(bench, {k: x**2 for k, x in innovation_sd(fit, r).items()})
         if record.held:  # a coil at rest stands still
             del checks["log_runs"]
         means = checks.pop("ohm").values
@@ -300,6 +308,9 @@ def record_facts(
             by_number = dict(zip(law.names, slopes[0, 3], strict=True))
             g = np.array([by_number.get(n, 0.0) for n in spread.names])
             coil = {"R": values["R"], "L": float(table[0, 3])}
+            y = np.column_stack([bench[role].values for role in _ROLES])
+            if not fit.problem.eddy:  # else the force lags
+                checks["in_time"] = check_lag(Signals(u=bench["voltage"].values[:, None], y=y, rate_hz=record.rate_hz))
             checks["sampling"] = sampling(coil, {"L": float(np.sqrt(g @ covariance @ g))}, record.rate_hz)
         checks.pop("weight", None)
         for check, result in checks.items():
