@@ -106,8 +106,8 @@ def estimate_bearing(
                 sure = not same and richer.status != "failed" and _saturates(richer)
                 fit = richer if same or (sure and (white is None or white(richer))) else fit
             fit = rescue(
-                fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
-                lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
+                fit if delay is not None or fit.status == "failed" else with_fraction(fit, ticks[-1]), records,
+                lambda f: f if delay is not None or f.status == "failed" else with_fraction(f, again),
                 search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
             )  # fmt: skip
             if white is not None and "drift" in extend:
@@ -382,7 +382,7 @@ def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:
     return vector
 
 
-def _with_fraction(fit: BearingFit, tick: Tick | None) -> BearingFit:
+def with_fraction(fit: BearingFit, tick: Tick | None = None) -> BearingFit:
     """Free a delay that was whole where the score test says so; put one back that came out whole."""
     price = float(np.log(fit.problem.n_used))
     for rate in fit.problem.delays:

@@ -457,16 +457,17 @@ def _correct(
 
 @compiled
 def predict(
-    states: States, u: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, end: int, whole: int,
-    th: Array, active: Integers, chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array,
-    X: Array, e: Array, s: Array, rows: Array,
+    states: States, u: Array, push: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, end: int,
+    whole: int, th: Array, active: Integers, chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array,
+    P: Array, X: Array, e: Array, s: Array, ahead: Array, rows: Array,
 ) -> bool:  # fmt: skip
     """Run the predictor from sample `first` to `end`; False where a gap closes or numbers cease to be finite. `u` (n,),
-    `loose` (n,) its unknown variance, `knock` (n, 2) that of force and back-EMF; `y`, `valid` (n, 2): position and
-    current, and whether measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or
-    twice the square of a level; without lanes the criterion alone. `noise2`: squared levels of position, current,
-    force, voltage and their drifts (of one sample). `z`, `P`, `X` (`ROOM`,; zero at first), state, covariance and
-    derivatives before `first`, move along; `e`, `s` (n, 2) get innovations and variances, `rows` (4 (end - first),
+    `push` (n,) an acceleration that is known, `loose` (n,) the voltage's unknown variance, `knock` (n, 2) that of force
+    and back-EMF; `y`, `valid` (n, 2): position and current, and whether measured; `active`, `chain` (p,): kind of each
+    lane, and the derivative by it of a number, or twice the square of a level; without lanes the criterion alone.
+    `noise2`: squared levels of position, current, force, voltage and their drifts (of one sample). `z`, `P`, `X`
+    (`ROOM`,; zero at first), state, covariance and derivatives before `first`, move along; `e`, `s` (n, 2) get
+    innovations and variances, `ahead` (n, 3) position, velocity and current as predicted, `rows` (4 (end - first),
     p + 1) the likelihood's.
     """
     n = len(states)
@@ -476,8 +477,10 @@ def predict(
     for j in range(active.size):
         if active[j] >= MAGNET:
             X[(_KIND + active[j] - MAGNET) * PITCH + j] = chain[j]
-    phi = th[LATE]
+    phi, gravity, th = th[LATE], th[GRAVITY], th.copy()
     for k in range(first, end):
+        for o in range(3):
+            ahead[k, o] = z[o]
         for o in range(2):
             if valid[k, o]:
                 e[k, o] = y[k, o] - z[2 * o] - th[X_OFF + o]
@@ -489,6 +492,7 @@ def predict(
         if whole > 0:
             soon = u[k - whole + 1]
             volts[4], volts[5] = now - soon, -6.0 * (soon - now)
+        th[GRAVITY] = gravity + push[k]
         q2[0] = noise2[2] + knock[k, 0]
         q2[1] = noise2[3] + max(loose[k - whole - 1], loose[k - whole]) + knock[k, 1]
         q2[2], q2[3] = noise2[4], noise2[5]

@@ -53,6 +53,9 @@ class BearingFit(PhysicalFit):
 
     problem: BearingProblem
     at: Linear | None  # the criterion about `vector`; None where the search failed
+    beside: Array | None = (
+        None  # (n, n), what the covariance of the numbers gains by sizes of nuisances, vector's units
+    )
     beaten: float = 0.0  # by how much a law that was not asked for lowers the criterion with its price
 
 
@@ -64,6 +67,12 @@ class Innovations:
     # was measured
     e: Array
     s: Array
+    ahead: Array  # (n_samples, 3), position, velocity and current as predicted from all samples before, SI
+
+    @classmethod
+    def of(cls, n: int) -> Innovations:
+        """Return room for those of `n` samples."""
+        return cls(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan), ahead=np.full((n, 3), np.nan))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,8 +86,7 @@ class Rows:
 
 def run(problem: BearingProblem, vector: Array, r: int) -> Innovations | None:
     """Run the predictor over record number `r`; None where there is no predictor."""
-    n = problem.records[r].u.size
-    innovations = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+    innovations = Innovations.of(problem.records[r].u.size)
     for part in sweep(problem, vector, r, innovations, slopes=False):
         if part is None:
             return None
@@ -122,6 +130,7 @@ def sweep(
     p = len(lanes)
     rows = np.zeros((4 * _BLOCK if slopes else 1, p + 1))
     steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
+    push = np.zeros(record.u.size) if record.push is None else record.push
     valid, numbers = record.valid & np.array([not record.held, True]), np.array(lanes, dtype=np.int64)
     for first, last in record.parts:
         begin = max(first + (_ABOUT if first else 0), problem.skip)
@@ -132,8 +141,8 @@ def sweep(
         for at in range(begin, last, _BLOCK):
             end, rows[:] = min(at + _BLOCK, last), 0.0
             done = predict(
-                states, record.u, loose, knocks, record.y, valid, at, end, whole, theta, numbers, chain, noise2, flags,
-                1.0 / record.rate_hz, steps, z, P, X, innovations.e, innovations.s, rows,
+                states, record.u, push, loose, knocks, record.y, valid, at, end, whole, theta, numbers, chain, noise2,
+                flags, 1.0 / record.rate_hz, steps, z, P, X, innovations.e, innovations.s, innovations.ahead, rows,
             )  # fmt: skip
             if not done:
                 yield None
@@ -266,7 +275,7 @@ def _of_record(
 ) -> tuple[Innovations, Array, list[Array]] | None:
     """Innovations of a record, the scores of its stretches, and the triangle; None without a predictor."""
     n = problem.records[r].u.size
-    innovations = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+    innovations = Innovations.of(n)
     width = problem.size + 2 * len(problem.settled)
     own, blocks, columns = np.zeros((-(-n // stretch), width)), list[Array](), np.zeros(0, dtype=np.int64)
     for part in sweep(problem, vector, r, innovations, slopes=True, delays=True):
@@ -396,8 +405,8 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
     middle = centred * np.sqrt(len(centred) / max(len(centred) - 1, 1))
     half = whole @ middle.T
     sandwich = half @ half.T
-    unit = np.outer(chain, chain)
-    information, wide = whole[:n, :n] * unit, sandwich[:n, :n] * unit
+    unit, more = np.outer(chain, chain), 0.0 if fit.beside is None else fit.beside
+    information, wide = (whole[:n, :n] + more) * unit, (sandwich[:n, :n] + more) * unit
     for j in np.flatnonzero(fit.vector[:n] >= problem.upper()[:n]).tolist():
         # at its bound: the records do not tell it from anything beyond
         information[j, j], wide[j, j] = (max(c[j, j], chain[j] ** 2) for c in (information, wide))
@@ -423,7 +432,7 @@ def bearing_moves(fit: BearingFit, errors: Sequence[SensorError]) -> Array:
     inverse = directions(fit.at.J[:, free]).inverse()
 
     def half(error: SensorError, by: float) -> Array:
-        at = linearise(_with_error(problem, error, by), vector)
+        at = linearise(with_error(problem, error, by), vector)
         if at is None:
             raise np.linalg.LinAlgError("no predictor")
         return np.asarray(at.J.T @ at.r)
@@ -448,7 +457,7 @@ def _size(problem: BearingProblem, error: SensorError) -> float:
     )
 
 
-def _with_error(problem: BearingProblem, error: SensorError, by: float) -> BearingProblem:
+def with_error(problem: BearingProblem, error: SensorError, by: float) -> BearingProblem:
     """Return a problem in which a channel of all records, their time or a number that is known is too large."""
     if error.kind == "fixed":
         numbers = (replace(n, value=n.value + by) if n.name == error.channel else n for n in problem.numbers)

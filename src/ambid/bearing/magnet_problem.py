@@ -67,6 +67,7 @@ class BearingRecord:
     # predictor begins anew after them. None: none.
     cut: NDArray[np.bool_] | None = None
     zero: float | None = None  # of the position, m, taken out and searched beside the numbers; None: that of the rest
+    push: Array | None = None  # (n_samples,), m/s^2, or None, acceleration by a known force during each sample
 
     @property
     def parts(self) -> tuple[tuple[int, int], ...]:
@@ -88,7 +89,7 @@ class BearingRecord:
 
     def part(self, samples: slice) -> BearingRecord:
         """Return some samples in a row of the record."""
-        names = [n for n in ("u", "loose", "y", "valid", "knock", "cut") if getattr(self, n) is not None]
+        names = [n for n in ("u", "loose", "y", "valid", "knock", "cut", "push") if getattr(self, n) is not None]
         return replace(self, **{name: getattr(self, name)[samples] for name in names})
 
 

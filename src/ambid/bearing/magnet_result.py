@@ -30,7 +30,7 @@ from ambid.estimation.estimate import (
     read_as,
     read_whole,
 )
-from ambid.estimation.result import Linear, Predicting
+from ambid.estimation.result import NORMAL_95, Linear, Predicting
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.nonlinear import IDEAL, PowerStage
 
@@ -46,12 +46,12 @@ class Curve:
     @property
     def low(self) -> Array:
         """Lower edge of the 95 % band, shape (n_points,)."""
-        return np.asarray(self.value - 1.96 * self.sd)
+        return np.asarray(self.value - NORMAL_95 * self.sd)
 
     @property
     def high(self) -> Array:
         """Upper edge of the 95 % band, shape (n_points,)."""
-        return np.asarray(self.value + 1.96 * self.sd)
+        return np.asarray(self.value + NORMAL_95 * self.sd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,7 +83,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     eddy, drift : bool
         Whether the force has a pole a/(s + a), and whether a force and a voltage may drift.
     extended : tuple of str
-        What the model was extended by because it pays: drift, or zeros of the position, one for each record.
+        What the model was extended by: zeros of the position, one for each record but the first, and drift because they
+        pay; lines and a drift of R that the innovations showed.
     records : tuple of Mapping
         ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` of each.
     parameters : tuple of EstimatedParameter
@@ -283,8 +284,8 @@ def _at_operating_point(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
     at = estimate.curves(estimate.operating_point["position"], estimate.operating_point["current"])
     entries = {}
     for name, c in (("k_x", at.k_x), ("k_i", at.k_i), ("L", at.L)):
-        value, sd = float(c.value[0]), float(c.sd[0])
-        entries[name] = {"value": value, "sd": sd, "ci95": [value - 1.96 * sd, value + 1.96 * sd], "unit": c.unit}
+        ends = [float(c.low[0]), float(c.high[0])]
+        entries[name] = {"value": float(c.value[0]), "sd": float(c.sd[0]), "ci95": ends, "unit": c.unit}
     return entries
 
 

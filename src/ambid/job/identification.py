@@ -50,10 +50,6 @@ if TYPE_CHECKING:
     from ambid.validation.causes import Cause
 
 _CAUSES = 6  # by which a model is extended, one after another
-_OF_THE_MODEL = {
-    "causes", "residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree",
-}  # fmt: skip
-"""Checks that an extension has to pass: those that asked for it."""
 
 
 @of_job("identify")
@@ -268,7 +264,7 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
     first estimate stays, with its causes; also where a fixed value or a prior may be what is wrong, unless the cause
     changes in time.
     """
-    from ambid.validation.causes import extended, told
+    from ambid.validation.causes import extended, told, worse
     from ambid.validation.residuals import P_LEAST
 
     estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
@@ -286,10 +282,8 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
         fit, plain, taken = more
         estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
         estimate = replace(estimate, extended=told(fit, taken))
-    before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
-    worse = after & _OF_THE_MODEL or after - before - {"fixed_agree"} or len(after) >= len(before)
-    if worse or not taken:
-        return first if worse else estimate
+    if worse(first.checks, estimate.checks) or not taken:
+        return first if worse(first.checks, estimate.checks) else estimate
     moved = {name: math.hypot(sd, estimate[name].value - first[name].value) for name, sd in estimate.bias_sd.items()}
     return replace(estimate, bias_sd=moved)
 
@@ -450,8 +444,7 @@ def identify_nonlinear(
         If nothing can be identified from the records.
     """
     from ambid.bearing.magnet_estimate import estimate_bearing
-    from ambid.bearing.magnet_likelihood import uncertainty
-    from ambid.job.nonlinear_bearing import BearingWords, bearing_rig, judge_bearing, laws_of, numbers_of, take_all
+    from ambid.job.nonlinear_bearing import BearingWords, bearing_rig, grown_bearing, laws_of, numbers_of, take_all
     from ambid.validation.nonlinear_bearing import validation, white
 
     words = BearingWords(
@@ -474,7 +467,7 @@ def identify_nonlinear(
         )
     clock.lap("fit")
     say("check")
-    estimate = disowned(judge_bearing(fit, uncertainty(fit), readings, bench))
+    estimate = disowned(grown_bearing(fit, readings, bench))
     clock.lap("checks")
     estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=readings)
     if second is not None:

@@ -4,7 +4,6 @@ magnet (not the same data or channel twice, the stage off, a held rotor that mov
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_estimate import PARTS
-from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, bearing_moves
+from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, bearing_moves, uncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, BearingRecord, touching, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError, counted
@@ -31,10 +30,13 @@ from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig, RigMagnet
 from ambid.settings.caller import setting
+from ambid.validation.bearing_causes import bearing_causes, bearing_look, extended_bearing
+from ambid.validation.causes import Cause, causes_check, named_bias, told_of, worse
 from ambid.validation.nonlinear_bearing import (
-    WhitenessTest,
+    Whiteness,
     agreement,
     agreement_check,
+    innovation_sd,
     record_facts,
     whiteness,
     whiteness_checks,
@@ -47,6 +49,7 @@ _REVERSED = 0.2  # largest current backwards over that forwards from which two m
 _SAME = 1e-9  # part of a channel's spread that another one leaves over, at or below which both are the same signal
 _ROCKS = 0.25  # spread of a held position over that of the moving ones from which it is told
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
+_CAUSES = 6  # by which a model is extended
 _ROLES = ("position", "current")
 _OFFSETS = {"voltage": "v_offset", "current": "i_offset", "position": "x_offset"}
 
@@ -266,25 +269,42 @@ def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:
     return replace(one, warnings=(*one.warnings, warning))
 
 
-def judge_bearing(
-    fit: BearingFit, spread: BearingUncertainty, readings: Sequence[TakenRecord], rig: Rig
-) -> NonlinearBearingEstimate:
-    """Check a fit that has not failed, with its `spread`, on its own `readings`; estimate without validation, timings
-    and rig.
+def grown_bearing(fit: BearingFit, readings: Sequence[TakenRecord], rig: Rig) -> NonlinearBearingEstimate:
+    """Judge a fit that has not failed on its own `readings`, and, while a check names a cause that changes in time and
+    that the model can take in, one with it; see `identification`. Estimate without validation, timings and rig.
     """
-    problem, names = fit.problem, _names(fit)
+    estimate, found = _judged(fit, readings, rig)
+    first, given = estimate, rig.channel("voltage").delay != "auto"
+    taken: tuple[Cause, ...] = ()
+    while len(taken) < _CAUSES and not estimate.checks["causes"].passed:
+        more = extended_bearing(fit, found, readings[0].record, taken, delay_given=given)
+        if more is None:
+            break
+        fit, taken = more
+        estimate, found = _judged(fit, readings, rig)
+        estimate = replace(estimate, extended=tuple(dict.fromkeys([*estimate.extended, *map(told_of, taken)])))
+    return first if worse(first.checks, estimate.checks) else estimate
+
+
+def _judged(fit: BearingFit, readings: Sequence[TakenRecord], rig: Rig) -> tuple[NonlinearBearingEstimate, list[Cause]]:
+    """Check a fit on its own `readings`; return the estimate and the causes that innovations may have."""
+    problem, names, spread = fit.problem, _names(fit), uncertainty(fit)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
-        tests = list(threads.map(lambda r: whiteness(fit, r), range(len(problem.records))))
-    residuals = whiteness_checks(tests, names)
+        tests = list(threads.map(partial(whiteness, fit), range(len(names)), names if len(names) > 1 else [""]))
+    residuals = whiteness_checks(tests)
     alone = agreement(fit, spread, alone=True)
     residuals |= {"records_agree": agreement_check(alone)} if alone.strides else {}
     robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
     moves = [alone.beyond_chance(), agreement(fit, spread, alone=False).beyond_chance()] if robust else []
-    told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig)
-    spread = replace(spread, disagreement=np.vstack([*moves, contradicted]))
-    wide = robust or len(contradicted) > 0
+    told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig, robust=robust)
+    given = rig.channel("voltage").delay != "auto"
+    found, named, biased = _causes(
+        fit, spread, {**told, **residuals}, tests, readings, robust=robust, delay_given=given
+    )
+    spread = replace(spread, disagreement=np.vstack([*moves, contradicted, biased]))
+    wide = robust or bool(np.any(spread.disagreement))
     parameters = _parameters(fit, spread, robust=wide)
-    checks = {**told, **residuals, "identifiable": _shown(parameters)} | _gravity(fit) | _law(fit)
+    checks = {**told, **residuals, **named, "identifiable": _shown(parameters)} | _gravity(fit) | _law(fit)
     noise = {
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
         for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
@@ -292,13 +312,13 @@ def judge_bearing(
     points = np.concatenate([r.kept for r in problem.records])
     moving = np.concatenate([r.kept for r in problem.records if not r.held])
     changed = tuple(w for t in readings for w in t.warnings)
-    delays = _delays(fit, spread, given=rig.channel("voltage").delay != "auto")
+    delays = _delays(fit, spread, given=given)
     estimate = NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
         law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in readings),
         parameters=parameters, covariance_names=spread.names, covariance=spread.covariance(robust=wide),
         covariance_method="robust" if wide else "information", delay=delays,
-        noise=noise, fit=_fits(fit, tests, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
+        noise=noise, fit=_fits(fit, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
         usual=_between(*np.quantile(moving, (0.025, 0.975), axis=0)),
         operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),
         hull=_hull(moving), coil_hull=_hull(points), criterion=fit.criterion,
@@ -306,10 +326,12 @@ def judge_bearing(
         extended=_extended_by(fit, rig),
         warnings=_warnings(fit, checks, robust=robust) + changed,
     )  # fmt: skip
-    return calibrated(
-        estimate, rig, rig.plant, estimate.values, spread.names, partial(bearing_moves, fit), offsets=_OFFSETS,
+    moves_of = partial(bearing_moves, fit)
+    estimate = calibrated(
+        estimate, rig, rig.plant, estimate.values, spread.names, moves_of, offsets=_OFFSETS,
         places=sum(not r.held for r in problem.records) > 1 and all(r.zero is None for r in problem.records),
     )  # fmt: skip
+    return estimate, found
 
 
 def _extended_by(fit: BearingFit, rig: Rig) -> tuple[str, ...]:
@@ -327,14 +349,33 @@ def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict
     }
 
 
-def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
+def _causes(
+    fit: BearingFit, spread: BearingUncertainty, checks: Mapping[str, Check], tests: Sequence[Whiteness],
+    readings: Sequence[TakenRecord], *, robust: bool, delay_given: bool,
+) -> tuple[list[Cause], dict[str, Check], Array]:  # fmt: skip
+    """Return the causes that the innovations of the moving record which fits worst may have, judged, and how far those
+    seen, and bands left out where checks failed (`robust`), move the numbers, (n_moves, n), SI.
+    """
+    worst = min((r for r, x in enumerate(fit.problem.records) if not x.held), key=lambda r: tests[r].p)
+    look, own = bearing_look(fit, worst), np.sqrt(np.diag(spread.information))
+    if look is None:
+        return [], {"causes": Check(passed=True, detail="no cause could be looked for")}, np.zeros((0, own.size))
+    found, judged = list[Cause](), dict[str, Check]()
+    for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
+        found = bearing_causes(look, thorough=thorough, delay_given=delay_given)
+        judged = causes_check(found, checks, own, robust=robust, record=readings[worst].bench)
+        if judged["causes"].passed:
+            break
+    return found, judged, np.vstack([named_bias(found, np.zeros(own.size)), *([look.bands()] if robust else [])])
+
+
+def _fits(fit: BearingFit, names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
     fits: dict[str, dict[str, OutputFit]] = {}
-    for name, record, test in zip(names, fit.problem.records, tests, strict=True):
-        spread = record.kept.std(axis=0).tolist()
+    for r, (name, record) in enumerate(zip(names, fit.problem.records, strict=True)):
+        spread = dict(zip(_ROLES, record.kept.std(axis=0).tolist(), strict=True))
         fits[name] = {
-            role: OutputFit(one_step=1.0 - sd / spread[c], simulation=None, innovation_sd=sd)
-            for c, (role, sd) in enumerate(zip(_ROLES, test.innovation_sd, strict=True))
-            if math.isfinite(sd)
+            role: OutputFit(one_step=1.0 - sd / spread[role], simulation=None, innovation_sd=sd)
+            for role, sd in innovation_sd(fit, r).items()
         }
     return fits
 
@@ -353,9 +394,7 @@ def _names(fit: BearingFit) -> list[str]:
 
 def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) -> tuple[EstimatedParameter, ...]:
     """Return every number that acts."""
-    law, values, parameters = fit.problem.law, fit.problem.values(fit.vector), list[EstimatedParameter]()
-    moves = _moves(fit)
-    sds = np.sqrt(np.diag(spread.covariance(robust=robust)))
+    law, values, numbers = fit.problem.law, fit.problem.values(fit.vector), fit.problem.numbers
     acts = {
         "sigma": law.saturation,
         "L_rise": law.rise,
@@ -365,24 +404,22 @@ def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) ->
         "tau": fit.problem.drift,
     }
     acts |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
-    drop = values["v_drop"] != 0.0 or any(n.name == "v_drop" and n.estimated for n in fit.problem.numbers)
+    drop = values["v_drop"] != 0.0 or any(n.name == "v_drop" and n.estimated for n in numbers)
     acts |= dict.fromkeys(("v_drop", "i_drop"), drop)
-    for n in fit.problem.numbers:
-        if not acts.get(n.name, True):
-            continue
-        j = spread.names.index(n.name) if n.estimated else -1
-        sd, value = float(sds[j]) if n.estimated else 0.0, values[n.name]
-        prior = np.isfinite(n.prior_sd)
-        size = max(n.magnitude, abs(value)) if n.signed else value
-        share = None
-        if prior and n.estimated:
-            share = float(np.clip(1.0 - spread.information[j, j] / n.prior_sd**2, 0.0, 1.0))
-        role: Literal["free", "fixed", "prior"] = "fixed" if not n.estimated else "prior" if prior else "free"
-        identifiable = not n.estimated or sd < WEAK * abs(size) or sd * moves.get(n.name, np.inf) < WEAK
-        parameters.append(EstimatedParameter(
-            name=n.name, unit=UNITS[n.name], value=value, sd=sd, ci95=(value - 1.96 * sd, value + 1.96 * sd),
-            role=role, identifiable=identifiable, data_share=share,
-        ))  # fmt: skip
+    both = np.diag(spread.information), np.sqrt(np.diag(spread.covariance(robust=robust)))
+    own, sd = (dict(zip(spread.names, x.tolist(), strict=True)) for x in both)
+    moves = _moves(fit)
+    size = {n.name: max(n.magnitude, abs(values[n.name])) if n.signed else values[n.name] for n in numbers}
+    seen = {n: x < WEAK * abs(size[n]) or x * moves.get(n, np.inf) < WEAK for n, x in sd.items()}
+    parameters = list[EstimatedParameter]()
+    for n in (n for n in numbers if acts.get(n.name, True)):
+        prior = n.estimated and np.isfinite(n.prior_sd)
+        known = Parameter(
+            name=n.name, unit=UNITS[n.name], value=n.value, sd=n.prior_sd if prior else None,
+            role="prior" if prior else "free" if n.estimated else "fixed",
+        )  # fmt: skip
+        alone = {n.name: float(max(1.0 / own[n.name] - 1.0 / n.prior_sd**2, 1e-300) ** -0.5)} if prior else None
+        parameters.append(EstimatedParameter.of(known, values, sd, seen, alone))
     return tuple(parameters)
 
 
@@ -403,7 +440,6 @@ def _moves(fit: BearingFit) -> dict[str, float]:
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
-
     hidden = [p.name for p in parameters if not p.identifiable]
     detail = "every estimated parameter is identifiable" if not hidden else (
         f"not identifiable from these records: {', '.join(hidden)} (relative standard deviation above 25 %). Fix them, "

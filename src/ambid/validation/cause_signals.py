@@ -166,10 +166,13 @@ TEXT = {
     "bandwidth. Log the coil's voltage, or excite more slowly",
     "fixed_value": "the fixed {channel} fits better {where} where it is: it is wrong, or a gain or the rate is. Check "
     "it, or free it",
+    "rate": "the sampling rate is said {size:+.2%} too high. Check it, and fixed values",
     "sampling": "the voltage changes between samples, so that its log does not say what the coil got. Log every sample "
     "of the controller",
     "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",
     "curvature": "force or flux bends over this motion or current. Excite less, or identify the nonlinear magnet",
+    "law": "force or flux bends otherwise over this motion than the magnet's law says. Record over less of the gap, or "
+    "give the law's missing part",
     "limiter": "the amplifier does not follow the logged voltage at its ends. Log the coil's voltage, or excite less",
     "hysteresis": "force or flux follows the current with a slack: hysteresis. Excite more, or demagnetise",
     "flexible_mode": "the position holds a further mode. Excite below it, or use model rotor",

@@ -15,8 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.bearing.uncertainty import farthest
@@ -67,12 +69,17 @@ _KNOWN = {"fixed_value", "sensor_gain", "rate"}
 """Causes in what the rig says."""
 _OPPOSING = {"dead_time", "friction"}
 """Causes that physics gives a sign."""
+_OF_THE_MODEL = {
+    "causes", "residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree",
+}  # fmt: skip
+"""Checks that an extension has to pass: those that asked for it."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
 _TURNS = 8  # in which sizes and parameters are found in turn
 _NEAR = 1.5  # ratio of frequencies within which colours are of one shape
-_SETTLED = 0.1  # gain below which they are
+SETTLED = 0.1  # gain below which they are
+_SOUND = Check(passed=True, detail="")  # of what was not looked for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,9 +98,27 @@ class Cause:
     far: bool = False  # a fixed value that would have to change by more than itself: what is missing lies elsewhere
 
 
+class Look(Protocol):
+    """A fit with its innovations over the samples that are looked at."""
+
+    @property
+    def course(self) -> Course:
+        """Return the signals."""
+
+    @property
+    def white(self) -> Array:
+        """Return the innovations, (n, n_outputs), of unit variance."""
+
+    def ways(self, which: slice) -> dict[str, Complex]:
+        """Return how a force, a voltage or an error of a sensor shows at some frequencies, (n_lines, n_outputs)."""
+
+    def tested(self, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> list[Cause]:
+        """Test groups of signals, each together."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Look:
-    """A fit with its innovations over the samples that are looked at."""
+    """That of a linear fit."""
 
     fit: Fit
     predictor: Predictor
@@ -101,6 +126,27 @@ class _Look:
     e: Array  # (n, n_outputs), scaled
     at: slice
     course: Course
+
+    @property
+    def white(self) -> Array:
+        return self.e @ self.weight.T
+
+    def ways(self, which: slice) -> dict[str, Complex]:
+        predictor, model, n = self.predictor, self.fit.problem.model, self.e.shape[0]
+        values, vectors = np.linalg.eig(predictor.M[:, : predictor.A.shape[0]])
+        z = np.exp(2j * np.pi * np.arange(2, (n + 1) // 2)[which] / n)
+        enter = np.linalg.solve(vectors, np.hstack([predictor.E, -predictor.gain]).astype(complex))
+        through = -np.einsum("oj,kj,jb->kob", predictor.C @ vectors, 1.0 / (z[:, None] - values), enter)
+        through[:, :, len(model.disturbances) :] -= np.eye(len(model.outputs))
+        names = (*model.disturbances, *model.outputs)
+        return {name: through[:, :, j] @ self.weight.T for j, name in enumerate(names) if name in _CHANNELS}
+
+    def tested(self, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> list[Cause]:
+        problem = self.fit.problem
+        sums = _sums(self, _through(self, [column for _, columns in groups for column in columns]))
+        kept = np.ones(problem.size, dtype=bool)
+        kept[problem.slices["noise"]] = False
+        return tested(sums, groups, kept, problem.magnitude)
 
 
 def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
@@ -127,8 +173,14 @@ def causes(
     look = _look(fit, means)
     if look is None:
         return []
-    course, rate_hz = look.course, fit.problem.rate_hz
-    spectra = _spectra(look.e @ look.weight.T)
+    freed = {name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed
+    return ranked([*seen(look, thorough=thorough, delay_given=delay_given), *_fixed(look, rig, freed)])
+
+
+def seen(look: Look, *, thorough: bool, delay_given: bool = False) -> list[Cause]:
+    """Return the causes beyond model and rig that innovations may have."""
+    course, rate_hz = look.course, look.course.rate_hz
+    spectra = _spectra(look.white)
     lines = _lines(look)
     top_hz = _top(spectra, lines) * rate_hz / course.t.size if thorough else 0.0
     groups = list(groups_of(course, top_hz, thorough=thorough))
@@ -136,16 +188,20 @@ def causes(
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
     groups += [("line", _waving(lines, course.t.size))] if lines else []
-    found = _tested(look, groups)
+    found = look.tested(groups)
     if lines:
         line = found.pop()
         at, p = lines[0].k * rate_hz / course.t.size, min(line.p, lines[0].p)
         found.append(replace(line, channel=lines[0].channel, size=at, p=p))
-    found += _fixed(look, rig, {name: free_one(fit, name) for name in fit.problem.known} if freed is None else freed)
     if thorough:
-        found += _colours(spectra, _ways(look, slice(None)), rate_hz, fit.problem.n_physical)
-    found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
-    return [
+        found += _colours(spectra, look.ways(slice(None)), rate_hz, found[0].shift.size)
+    return found
+
+
+def ranked(found: Sequence[Cause]) -> list[Cause]:
+    """Return causes, the strongest first, without those of the wrong sign."""
+    found = sorted(found, key=_net)
+    return [  # a current that drifts acts as force and voltage together, and explains much of either
         c for c in found if (c.name != "slow_current" or c is found[0]) and not (c.name in _OPPOSING and c.size < 0.0)
     ]
 
@@ -212,23 +268,17 @@ def extended(
     voltage is known to the predictor. Sizes and parameters are found in turn, and the information of the parameters is
     what is left beside the sizes.
     """
-    sure = [c for c in _sure(found) if c.name not in _KNOWN]
-    if not sure or fit.problem.n_used > _LONGEST:
+    strong = _strong(found, doubtful=doubtful)
+    if not strong or fit.problem.n_used > _LONGEST:
         return None
-    strong = [c for c in sure if c.gain > _ALIKE * sure[0].gain]
-    if doubtful:
-        strong = [c for c in strong if c.name in _IN_TIME]
-    if not strong or any(c.name not in _GROWING for c in strong):
-        return None
-    cause, more = strong[0], None
-    alike = {(c.name, c.channel): c for c in reversed(strong) if c.name not in _NOISE}
-    alike.pop((cause.name, cause.channel), None)
+    cause, alike = strong[0], to_take(found, doubtful=doubtful)[1:]
+    more = None
     if cause.name not in _NOISE:
         n, size = fit.problem.n_physical, fit.problem.magnitude
         sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
         if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
             return None  # what is of higher degree would move them too
-        more = _with_causes(fit, means, plain, taken, (cause, *alike.values()))
+        more = _with_causes(fit, means, plain, taken, (cause, *alike))
         more = _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
     if more is not None:
         return _resettled(more[0], means, plain, more[1])
@@ -239,6 +289,32 @@ def extended(
     if louder is None:
         return None
     return _resettled(louder, means, plain, taken)
+
+
+def worse(first: Mapping[str, Check], after: Mapping[str, Check]) -> bool:
+    """Whether a model that was extended is no better than before: it does not fit, more checks fail, or one that did
+    not, but that a fixed value shows as wrong.
+    """
+    had, has = ({name for name, c in checks.items() if not c.passed} for checks in (first, after))
+    return bool(has & _OF_THE_MODEL or has - had - {"fixed_agree"} or len(has) >= len(had))
+
+
+def _strong(found: Sequence[Cause], *, doubtful: bool = False) -> list[Cause]:
+    """Return the strongest cause, and those about as strong; none where a model cannot take one of them in."""
+    sure = [c for c in _sure(found) if c.name not in _KNOWN]
+    strong = [c for c in sure if c.gain > _ALIKE * sure[0].gain and (c.name in _IN_TIME or not doubtful)]
+    return [] if any(c.name not in _GROWING for c in strong) else strong
+
+
+def to_take(found: Sequence[Cause], *, doubtful: bool = False) -> list[Cause]:
+    """Return the strongest cause and those about as strong whose signals are known, each once; none where the
+    strongest is noise, or a model cannot take it in.
+    """
+    strong = _strong(found, doubtful=doubtful)
+    if not strong or strong[0].name in _NOISE:
+        return []
+    each = {(c.name, c.channel): c for c in reversed(strong) if c.name not in _NOISE}
+    return [strong[0], *(c for k, c in each.items() if k != (strong[0].name, strong[0].channel))]
 
 
 def _same(a: Colour, b: Colour) -> bool:
@@ -277,12 +353,13 @@ def _with_causes(
         look = None if fit.status == "failed" else _look(fit, means)
         if look is None:
             return None
-        parts = [replace(c, columns=_again(c, look.course)) for c in parts]
+        parts = [replace(c, columns=again(c, look.course)) for c in parts]
         columns = [z for c in parts for z in c.columns]
-        left = _tested(look, [("", tuple(columns))])[0]
+        left = look.tested([("", tuple(columns))])[0]
         step = np.split(left.sizes, np.cumsum([c.sizes.size for c in parts])[:-1])
-        if left.gain < _SETTLED and fit.status == "converged":
-            return replace(fit, beside=_beside(look, columns)), tuple(parts)
+        if left.gain < SETTLED and fit.status == "converged":
+            sums = _sums(look, _through(look, columns))
+            return replace(fit, beside=beside(sums, fit.problem.n_physical)), tuple(parts)
     return None
 
 
@@ -292,10 +369,10 @@ def told(fit: Fit, taken: Sequence[Cause]) -> tuple[str, ...]:
         f"{'slow' if c.damping is None else 'coloured'}_{c.source} ({c.frequency_hz:.3g} Hz)"
         for c in colours_of(fit.problem)
     ]
-    return tuple(dict.fromkeys([*map(_told, taken), *noise]))
+    return tuple(dict.fromkeys([*map(told_of, taken), *noise]))
 
 
-def _told(cause: Cause) -> str:
+def told_of(cause: Cause) -> str:
     """Return a cause and its size."""
     unit = {"line": " Hz"}
     unit |= dict.fromkeys(("sensor_lag", "eddy_pole", "current_sensor_pole"), " s")
@@ -303,7 +380,7 @@ def _told(cause: Cause) -> str:
     return f"{cause.name} ({cause.size:.3g}{unit[cause.name]})" if cause.name in unit else cause.name
 
 
-def _again(cause: Cause, course: Course) -> tuple[Column, ...]:
+def again(cause: Cause, course: Course) -> tuple[Column, ...]:
     """Return a cause's signals at another fit: those of lines are the same."""
     if cause.name == "line":
         return cause.columns
@@ -367,7 +444,7 @@ def _through(look: _Look, columns: Sequence[Column]) -> Array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Sums:
+class Sums:
     """Scalar products of slopes J, residuals r and columns C, whitened; priors are part of J and r."""
 
     own: Array  # J'J, (size, size)
@@ -378,7 +455,7 @@ class _Sums:
     square: float  # mean of r^2
 
 
-def _sums(look: _Look, C: Array) -> _Sums:
+def _sums(look: _Look, C: Array) -> Sums:
     """Sum over the samples that are looked at.
 
     Levels of noise are left out of what is projected: under the right model they are not correlated with what moves
@@ -403,7 +480,7 @@ def _sums(look: _Look, C: Array) -> _Sums:
         first += block.shape[0]
     cross = back.T @ cross
     cross[problem.slices["noise"]] = 0.0
-    return _Sums(
+    return Sums(
         own=back.T @ own @ back + fit.J_prior.T @ fit.J_prior, cross=cross,
         pull=back.T @ pull + fit.J_prior.T @ fit.r_prior, along=along,
         inner=sum((c @ c.T for c in C[1:]), C[0] @ C[0].T), square=square / max(look.e.size, 1),
@@ -415,19 +492,19 @@ def _scales(own: Array) -> Array:
     return column_sizes(np.sqrt(np.maximum(np.diag(own), 0.0))[None, :])
 
 
-def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> list[Cause]:
-    """Test groups of signals, each together."""
-    problem = look.fit.problem
-    sums = _sums(look, _through(look, [column for _, columns in groups for column in columns]))
-    kept = np.ones(problem.size, dtype=bool)
-    kept[problem.slices["noise"]] = False
+def tested(
+    sums: Sums, groups: Sequence[tuple[str, tuple[Column, ...]]], kept: NDArray[np.bool_], magnitude: Array
+) -> list[Cause]:
+    """Test groups of signals, each together, from the sums of all; `kept`: what is projected out of them, the numbers
+    of a `magnitude` first.
+    """
     own = sums.own[np.ix_(kept, kept)]
     scale = _scales(own)
     values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
     visible = values > _BLIND * values[-1]
     root = (vectors[:, visible] / np.sqrt(values[visible])).T / scale
-    seen = root @ sums.cross[kept]
-    rest, left = sums.inner - seen.T @ seen, sums.along - seen.T @ (root @ sums.pull[kept])
+    inside_J = root @ sums.cross[kept]
+    rest, left = sums.inner - inside_J.T @ inside_J, sums.along - inside_J.T @ (root @ sums.pull[kept])
     out, start = list[Cause](), 0
     for name, columns in groups:
         g = slice(start, start + len(columns))
@@ -438,10 +515,10 @@ def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> li
         inside = (vectors[:, distinct].T @ (left[g] / unit)) / values[distinct]
         sizes = -(vectors[:, distinct] @ inside) / unit
         gain = float(-sizes @ left[g]) / max(1.0, sums.square)
-        along = (root.T @ seen[:, g])[: problem.n_physical]
+        along = (root.T @ inside_J[:, g])[: magnitude.size]
         shift = -(along @ sizes)
         spread = np.sum((along @ (vectors[:, distinct] / unit[:, None])) ** 2 / values[distinct], axis=1)
-        shift = np.sign(shift) * np.sqrt(np.maximum(shift**2 - spread, 0.0)) * problem.magnitude
+        shift = np.sign(shift) * np.sqrt(np.maximum(shift**2 - spread, 0.0)) * magnitude
         out.append(Cause(
             name=name, channel=columns[0][0][0], gain=gain, p=chi_squared_tail(max(int(distinct.sum()), 1), gain),
             size=float(sizes[0]), shift=shift, sizes=sizes, columns=columns,
@@ -449,14 +526,12 @@ def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> li
     return out
 
 
-def _beside(look: _Look, columns: Sequence[Column]) -> Array:
-    """Return what the covariance of the physical parameters gains by the sizes of signals, over the magnitudes."""
-    sums = _sums(look, _through(look, columns))
+def beside(sums: Sums, n: int) -> Array:
+    """Return what the covariance of the first `n` parameters gains by the sizes of signals, over the magnitudes."""
     unit = np.sqrt(np.maximum(np.diag(sums.inner), 1e-300))
     taken = sums.cross / unit @ np.linalg.pinv(sums.inner / np.outer(unit, unit), rcond=_SAME, hermitian=True)
     scale = _scales(sums.own)
     both = [sums.own - taken @ (sums.cross / unit).T, sums.own]
-    n = look.fit.problem.n_physical
     left, plain = (np.linalg.pinv(x / np.outer(scale, scale), rcond=_BLIND, hermitian=True)[:n, :n] for x in both)
     values, vectors = np.linalg.eigh(0.5 * (left - plain + (left - plain).T))
     more = (vectors * np.maximum(values, 0.0)) @ vectors.T  # sizes never tell of the numbers
@@ -470,18 +545,6 @@ def _spectra(e: Array) -> Complex:
     return np.asarray(np.fft.rfft(e * window, axis=0)[2 : (n + 1) // 2], dtype=np.complex128)
 
 
-def _ways(look: _Look, which: slice) -> dict[str, Complex]:
-    """Return how a force, a voltage or an error of a sensor shows at some frequencies, (n_lines, n_outputs)."""
-    predictor, model, n = look.predictor, look.fit.problem.model, look.e.shape[0]
-    values, vectors = np.linalg.eig(predictor.M[:, : predictor.A.shape[0]])
-    z = np.exp(2j * np.pi * np.arange(2, (n + 1) // 2)[which] / n)
-    enter = np.linalg.solve(vectors, np.hstack([predictor.E, -predictor.gain]).astype(complex))
-    through = -np.einsum("oj,kj,jb->kob", predictor.C @ vectors, 1.0 / (z[:, None] - values), enter)
-    through[:, :, len(model.disturbances) :] -= np.eye(len(model.outputs))
-    names = (*model.disturbances, *model.outputs)
-    return {name: through[:, :, j] @ look.weight.T for j, name in enumerate(names) if name in _CHANNELS}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Line:
     k: float  # periods over the samples that are looked at
@@ -490,9 +553,9 @@ class _Line:
     p: float
 
 
-def _lines(look: _Look) -> list[_Line]:
+def _lines(look: Look) -> list[_Line]:
     """Return narrow lines that stand out, the strongest first, each after those before it are taken off."""
-    e, lines = look.e @ look.weight.T, list[_Line]()
+    e, lines = look.white, list[_Line]()
     while len(lines) < _LINES:
         spectra = _spectra(e)
         power, n_y = np.sum(np.abs(spectra) ** 2, axis=1), spectra.shape[1]
@@ -505,7 +568,7 @@ def _lines(look: _Look) -> list[_Line]:
         around = power[max(j - 12, 0) : j + 13]
         if p > _LINE or float(power[max(j - 1, 0) : j + 2].sum()) < _NARROW * float(around.sum()):
             break
-        ways = {name: way[0] for name, way in _ways(look, slice(j, j + 1)).items()}
+        ways = {name: way[0] for name, way in look.ways(slice(j, j + 1)).items()}
         shares = {name: abs(np.vdot(way, spectra[j])) ** 2 / np.vdot(way, way).real for name, way in ways.items()}
         first, second = sorted(shares, key=lambda name: -float(shares[name]))[:2]
         left = float(np.vdot(spectra[j], spectra[j]).real) - float(shares[first])
@@ -573,7 +636,8 @@ def causes_check(
     alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
     same = [n for n in SAME_AS.get(first.name, ()) if n != "sensor_lag" or record is None or "position" in record]
     others = tuple(dict.fromkeys([*alike, *same]))
-    if not checks["estimates_agree"].passed and between_samples(record):
+    refits = checks.get("estimates_agree", _SOUND)
+    if not refits.passed and between_samples(record):
         others = (*others, "sampling")
     late = checks.get("in_time")
     if late is not None and not late.passed:
@@ -587,13 +651,13 @@ def causes_check(
         text += "; more beside it"
     if others:
         text += f"; about as well explained by {' or '.join(others)}"
-    grave = checks["estimates_agree"].grave or (late is not None and not late.passed)
+    grave = refits.grave or (late is not None and not late.passed)
     net = first.gain - _PENALTY * first.sizes.size
     named = Check(
         passed=False, p=first.p, values={"gain": first.gain}, detail=f"{text} (chi-squared {first.gain:.3g})",
         grave=grave, cause=name, size=first.size if name == first.name else None, alternatives=others,
     )  # fmt: skip
-    fixed = checks["fixed_agree"]
+    fixed = checks.get("fixed_agree", _SOUND)
     if fixed.passed or max((c.gain for c in found if c.name == "fixed_value"), default=np.inf) - _PENALTY >= net:
         return {"causes": named}
     text = f"a fixed value would fit better elsewhere, by less than {first.name} explains"

@@ -27,6 +27,7 @@ from ambid.estimation.likelihood import Fit, Freed, evaluate, workspace_near
 from ambid.estimation.uncertainty import chi_squared_tail, natural_sizes
 from ambid.record import Record
 from ambid.rig import Rig
+from ambid.signals.faults import Dropouts, Saturation, find_dropouts, find_outliers, find_saturation, resolution
 
 _FAR = 2.0  # standard deviations between R and the means, whose offsets are allowed for generously
 _FURTHER = 4.0  # and below zero, from which the means alone contradict a coil
@@ -48,6 +49,15 @@ _SAYS, _ORDER = 0.25, 6  # part of the current's next change that a logged volta
 _NEAR_ENOUGH, _PARABOLA = 2.5, 2.0  # sd between weight and estimate, and rise of the criterion over that of a parabola
 _LAW = 0.01  # part of a force that may not grow as the square of the current
 _PER_COIL = 2.0  # samples in a coil's time constant below which its inductance is hardly seen
+_ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
+_SATURATED = 0.005  # part of the samples at a limit that a check lets pass
+_MISSING = {  # what a channel at its limits does to the parameters; measured on simulated benches, docs/checks.md
+    "voltage": "R and L come out too small if the coil's voltage went on, too large if the log is a command that the "
+    "amplifier did not follow; what it really limits does no harm",
+    "current": "without its peaks R, L and k_i come out too large",
+    "position": "without its peaks m comes out too large, and k_x wrong",
+}
+_COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
 
 
 def one_sided(current: Array) -> bool:
@@ -361,3 +371,58 @@ def informed(
     moved = fit.problem.parameters(vector)
     scale = natural_sizes(names, moved, fit.problem.model.references(moved))
     return replace(fit, vector=vector), spread.weighed(gain, slope, sd, scale), (gain, slope)
+
+
+def signal_checks(record: Record, outputs: tuple[str, ...]) -> dict[str, Check]:
+    """Check ``within_limits`` and ``signals_sound`` of a record whose channels are named by role."""
+    limits = {c.name: find_saturation(record, c.name) for c in record.channels}
+    return {"within_limits": _within_limits(limits), "signals_sound": _signals_sound(record, outputs, limits)}
+
+
+def _within_limits(saturations: Mapping[str, Saturation]) -> Check:
+    bad = {name: s for name, s in saturations.items() if s.fraction > _SATURATED}
+    detail = ". ".join(f"{s}{': ' + _MISSING[name] if name in _MISSING else ''}" for name, s in bad.items())
+    return Check(
+        passed=not bad,
+        values={f"{name}_fraction": s.fraction for name, s in saturations.items()},
+        detail=f"{detail}. Reduce the excitation, or cut those parts out" if bad else "no saturation",
+    )
+
+
+def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str, Saturation]) -> Check:
+    """Outliers and drop-outs of the measured outputs; an input may rightly stand still or kick."""
+    faults = [
+        (role, fault)
+        for role in outputs
+        for fault in (find_outliers(record, role), find_dropouts(record, role, saturation=limits[role]))
+    ]
+    some = [f"{role}: {f}" for role, f in faults if f.count]
+    most = max(faults, key=lambda fault: fault[1].count)[1]
+    few = max(f.count for _, f in faults) <= _ERRONEOUS * record.n_samples
+    return Check(
+        passed=few,
+        cause="" if few else "stuck" if isinstance(most, Dropouts) else "spikes",
+        values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in faults},
+        detail=f"{'; '.join(some)}. They were used unchanged; replace them (signals.replace_samples) or cut them out"
+        if some
+        else "no outliers or drop-outs in the measured outputs",
+    )
+
+
+def resolution_check(record: Record, variance: Mapping[str, float]) -> Check:
+    """Check that the steps of the converters are small beside the innovations, of a `variance` by role."""
+    text, worst = "", 0.0
+    for role, own in variance.items():
+        step = resolution(record, role).step
+        part = step**2 / 12.0 / own
+        if part > max(worst, _COARSE):
+            worst = float(part)
+            unit = record[role].unit
+            text = (
+                f"the steps of the {role}, {step:.3g} {unit}, make up {100.0 * min(part, 1.0):.2g} % of its innovations"
+            )
+    return Check(
+        passed=not text, values={"part": worst}, cause="quantisation" if text else "",
+        detail=f"{text}, and are no white noise. Use a finer range, or excite more" if text
+        else "the steps of the converters are small beside the innovations",
+    )  # fmt: skip

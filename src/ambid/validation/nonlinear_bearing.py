@@ -4,22 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.columns import check_lag
 from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, run, search, sweep, uncertainty
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
+from ambid.bearing.multistart import Signals
 from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
-from ambid.estimation.uncertainty import p_text
 from ambid.record import Record
 from ambid.rig import Rig
-from ambid.validation.facts import facts, ohm, sampling
+from ambid.validation.facts import facts, ohm, resolution_check, sampling, signal_checks
 from ambid.validation.physical import Agreement
-from ambid.validation.residuals import P_LEAST, fit_of, joint_triangle, score_of
+from ambid.validation.residuals import (
+    P_LEAST,
+    ResidualTest,
+    fit_of,
+    joint_triangle,
+    score_of,
+    uncorrelated_check,
+    white_check,
+)
 from ambid.validation.second_record import conclude, consistency_check
 
 _ROLES = ("position", "current")
@@ -33,20 +43,19 @@ _CONTRADICTS = 5.0  # standard deviations, of the largest of many moves
 _WEIGHT = 0.1  # relative error of the force at rest that a check lets pass
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WhitenessTest:
+class Whiteness(NamedTuple):
     """What the innovations of one record say."""
 
-    # probability of at least this much if the model is right, by both tests together: twice the smaller of them
-    p: float
-    p_own: float  # against past innovations, and against past voltages
-    p_input: float
-    largest: float  # largest correlation of an innovation with an earlier one, in magnitude
-    # root mean square innovations of position in m and current in A; NaN for what is not measured
-    innovation_sd: tuple[float, float]
+    own: ResidualTest  # against past innovations, and against past voltages
+    inputs: ResidualTest
+
+    @property
+    def p(self) -> float:
+        """Return the probability of at least this much if the model is right, by both tests together."""
+        return min(1.0, 2.0 * min(self.own.p, self.inputs.p))
 
 
-def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
+def whiteness(fit: BearingFit, r: int, name: str = "") -> Whiteness:
     """Test the innovations of one record against their own past and past voltages: an eddy pole between current and
     force leaves them white, as noise levels grow over it, but not independent of these.
     """
@@ -58,7 +67,6 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     begin, u = first + max(*_LAGS, *_INPUT_LAGS), fit.problem.records[r].u[:, None]
     past = [(white, k) for k in _LAGS] + [(u, k) for k in _INPUT_LAGS]
     mean = np.concatenate([x[begin - k : n - k].mean(axis=0) for x, k in past])
-    target, n_own = white[begin:], len(outputs) * len(_LAGS)
     triangles: list[list[Array]] = [[] for _ in outputs]
     for part in sweep(fit.problem, fit.vector, r, residuals, slopes=True):
         assert part is not None
@@ -69,18 +77,25 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
         for o, blocks in enumerate(triangles):
             blocks.append(triangle_of([np.column_stack([slopes[:, o], regressors, white[at:end, o]])]))
     whole, p = np.stack([triangle_of([np.vstack(blocks)]) for blocks in triangles], axis=1), slopes.shape[2]
-    own, by_input = (
-        score_of(joint_triangle(whole[..., :p], whole[..., -1], whole[..., which]), p)
-        for which in (slice(p, p + n_own), slice(p + n_own, -1))
-    )
-    spread = np.std(target, axis=0)
-    products = np.vstack([white[begin - k : n - k].T @ target for k in _LAGS])
-    correlation = np.abs(products) / target.shape[0] / np.outer(np.tile(spread, len(_LAGS)), spread)
-    rms = [float(np.sqrt(np.nanmean(residuals.e[first:, c] ** 2))) if c in outputs else float("nan") for c in (0, 1)]
-    return WhitenessTest(
-        p=min(1.0, 2.0 * min(own, by_input)), p_own=own, p_input=by_input, largest=float(correlation.max()),
-        innovation_sd=(rms[0], rms[1]),
-    )  # fmt: skip
+    tests, own = list[ResidualTest](), p + len(outputs) * len(_LAGS)
+    for columns, lags in ((whole[..., p:own], _LAGS), (whole[..., own:-1], _INPUT_LAGS)):
+        p_value, statistic, degrees = score_of(joint_triangle(whole[..., :p], whole[..., -1], columns), p)
+        size = np.linalg.norm(columns, axis=0) * np.linalg.norm(whole[..., -1], axis=0)[:, None]
+        found = np.max(np.abs(np.einsum("nok,no->ok", columns, whole[..., -1])) / np.maximum(size, 1e-300), axis=0)
+        at = int(np.argmax(found))
+        tests.append(ResidualTest(
+            p=p_value, statistic=statistic, degrees=degrees, largest=float(found[at]),
+            largest_lag=lags[at * len(lags) // found.size], channel=name,
+        ))  # fmt: skip
+    return Whiteness(*tests)
+
+
+def innovation_sd(fit: BearingFit, r: int) -> Mapping[str, float]:
+    """Return root mean square innovations of what a record measures, by role, SI."""
+    residuals = run(fit.problem, fit.vector, r) if fit.at is None else fit.at.innovations[r]
+    assert residuals is not None
+    rms = np.sqrt(np.nanmean(residuals.e[fit.problem.skip :, int(fit.problem.records[r].held) :] ** 2, axis=0))
+    return dict(zip(_ROLES[int(fit.problem.records[r].held) :], rms.tolist(), strict=True))
 
 
 def white(fit: BearingFit) -> bool:
@@ -243,11 +258,13 @@ def agreement(fit: BearingFit, spread: BearingUncertainty, *, alone: bool) -> Ag
 
 
 def record_facts(
-    fit: BearingFit, spread: BearingUncertainty, benches: Sequence[Record], names: Sequence[str], rig: Rig
-) -> tuple[dict[str, Check], Array]:
+    fit: BearingFit, spread: BearingUncertainty, benches: Sequence[Record], names: Sequence[str], rig: Rig, *,
+    robust: bool = False,
+) -> tuple[dict[str, Check], Array]:  # fmt: skip
     """Compare what each record says by itself with the estimate, and return the worst of each check, and how far R and
     the offset of the voltage move where the means contradict them, (n_contradicting, n), SI. `benches`: channels by
-    role; `names`: of the records. Of a record that was cut its longest part speaks, with the voltage that counts.
+    role; `names`: of the records; `robust`: whether other checks failed. Of a record that was cut its longest part
+    speaks, with the voltage that counts.
 
     A rig that gives an offset or a drop of the stage explains the means by it, and a stage that is off has none.
     """
@@ -257,13 +274,17 @@ def record_facts(
     explained = rig.magnet is not None and any(rig.magnet.known(n) is not None for n in _STAGE)
     found: dict[str, list[tuple[str, Check]]] = {}
     moves = list[list[float]]()
-    for record, bench, name in zip(fit.problem.records, benches, names, strict=True):
-        roles = ("voltage", "current") if record.held else ("voltage", "current", "position")
+    for r, (record, bench, name) in enumerate(zip(fit.problem.records, benches, names, strict=True)):
+        outputs = ("current",) if record.held else _ROLES
+        roles = ("voltage", *outputs)
         first, end = max(record.parts, key=lambda part: part[1] - part[0])
         values_of = {role: record.u if role == "voltage" else bench[role].values for role in roles}
         own = tuple(replace(bench[role], values=x[first:end]) for role, x in values_of.items())
         bench = replace(bench, channels=own, start_s=bench.start_s + first / bench.rate_hz)
-        checks = facts(bench, rig)
+        known = outputs if np.any(record.loose > 0.0) else roles  # a stage that is off is no limit
+        checks = {**facts(bench, rig), **signal_checks(bench[[*known]], outputs)}
+        if robust:
+            checks["resolution"] = resolution_check(bench, {k: x**2 for k, x in innovation_sd(fit, r).items()})
         if record.held:  # a coil at rest stands still
             del checks["log_runs"]
         means = checks.pop("ohm").values
@@ -287,6 +308,9 @@ def record_facts(
             by_number = dict(zip(law.names, slopes[0, 3], strict=True))
             g = np.array([by_number.get(n, 0.0) for n in spread.names])
             coil = {"R": values["R"], "L": float(table[0, 3])}
+            y = np.column_stack([bench[role].values for role in _ROLES])
+            if not fit.problem.eddy:  # else the force lags
+                checks["in_time"] = check_lag(Signals(u=bench["voltage"].values[:, None], y=y, rate_hz=record.rate_hz))
             checks["sampling"] = sampling(coil, {"L": float(np.sqrt(g @ covariance @ g))}, record.rate_hz)
         checks.pop("weight", None)
         for check, result in checks.items():
@@ -351,27 +375,10 @@ def _parts(fit: BearingFit) -> Iterator[BearingProblem]:
         yield replace(problem, records=tuple(replace(x, valid=x.valid & on) for x, on in pairs))
 
 
-def whiteness_checks(tests: Sequence[WhitenessTest], names: Sequence[str] = ()) -> dict[str, Check]:
-    """Check residuals against their own past and past voltages; each passes where every record (by `names`) does."""
-    checks = {}
-    for check, what, p in (
-        ("residuals_white", ("not white", "white"), [t.p_own for t in tests]),
-        (
-            "residuals_uncorrelated",
-            tuple(f"{x}correlated with past voltages" for x in ("", "un")),
-            [t.p_input for t in tests],
-        ),
-    ):
-        worst = min(range(len(p)), key=lambda r: p[r])
-        passed = p[worst] >= P_LEAST
-        words = [p_text(p[worst]) + (f" on {names[worst]}" if names else "")]
-        if check == "residuals_white":
-            words.insert(0, f"largest autocorrelation {max(t.largest for t in tests):.3f}")
-        detail = f"residuals are {what[passed]} ({', '.join(words)})"
-        checks[check] = Check(
-            passed=passed, p=p[worst], detail=detail, values=dict(zip(names, p, strict=True)) if names else {}
-        )
-    return checks
+def whiteness_checks(tests: Sequence[Whiteness]) -> dict[str, Check]:
+    """Check residuals against their own past and past voltages; each passes where every record does."""
+    own, inputs = (min(column, key=lambda t: t.p) for column in zip(*tests, strict=True))
+    return {"residuals_white": white_check(own), "residuals_uncorrelated": uncorrelated_check(inputs)}
 
 
 def _inside(estimate: NonlinearBearingEstimate, record: BearingRecord, outside: float) -> Check:

@@ -41,19 +41,11 @@ from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.rig.rig import Rig, RigMagnet
-from ambid.signals.faults import Dropouts, Saturation, find_dropouts, find_outliers, find_saturation, resolution
+from ambid.signals.faults import resolution
 from ambid.simulation.plant import closed_loop_poles
-from ambid.validation.facts import GRAVITY, agreements, one_sided
+from ambid.validation.facts import GRAVITY, agreements, one_sided, resolution_check, signal_checks
 from ambid.validation.residuals import P_LEAST, ResidualTest, consistent_check, uncorrelated_check, white_check
 
-_ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
-_SATURATED = 0.005  # part of the samples at a limit that a check lets pass
-_MISSING = {  # what a channel at its limits does to the parameters; measured on simulated benches, docs/checks.md
-    "voltage": "R and L come out too small if the coil's voltage went on, too large if the log is a command that the "
-    "amplifier did not follow; what it really limits does no harm",
-    "current": "without its peaks R, L and k_i come out too large",
-    "position": "without its peaks m comes out too large, and k_x wrong",
-}
 _WHITE_LAGS = (1, 2, 3, 5, 8, 13)
 _BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither record nor priors see
 _SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
@@ -239,7 +231,7 @@ def by_bands(fit: Fit) -> Array:
     For intervals of a model that does not fit: where noise is fed back, slopes hold some of it, and bands move the
     numbers a little also if the model is right.
     """
-    problem, n, kept = fit.problem, fit.problem.n_physical, np.ones(fit.problem.size + 1, dtype=bool)
+    problem, kept = fit.problem, np.ones(fit.problem.size + 1, dtype=bool)
     kept[problem.slices["noise"]] = False
     longest = 2 * _LONGEST // max(problem.y.shape[1], 2)  # no more numbers than of two outputs
     at = busiest(problem.u[problem.skip :], min(longest, problem.n_used))
@@ -247,13 +239,20 @@ def by_bands(fit: Fit) -> Array:
     for block in residual_blocks(problem, fit.vector, weight_of(fit.covariance), workspace_near(fit, problem)):
         parts.append(block[max(at.start - first, 0) : max(at.stop - first, 0), :, kept])
         first += len(block)
-    rows = np.concatenate(parts)
+    prior = np.column_stack([fit.J_prior, fit.r_prior])[:, kept]
+    return without_bands(np.concatenate(parts), prior.T @ prior, problem.magnitude)
+
+
+def without_bands(rows: Array, rest: Array, magnitude: Array) -> Array:
+    """Return the moves of `by_bands` from slopes and residual of each sample, (n, n_outputs, p + 1), and the products
+    (p + 1, p + 1) of all `rest` that is known of the p numbers, those of a `magnitude` first.
+    """
+    n = magnitude.size
     lines = np.fft.rfft(rows, axis=0) * np.sqrt(2.0 / len(rows))
     lines[0] /= np.sqrt(2.0)
     octaves = np.split(lines, 2 ** np.arange(1, int(np.log2(len(lines)))))
     sums = [(f.conj().T @ f).real for f in (octave.reshape(-1, octave.shape[-1]) for octave in octaves)]
-    prior = np.column_stack([fit.J_prior, fit.r_prior])[:, kept]
-    whole = np.sum(sums, axis=0) + prior.T @ prior
+    whole = np.sum(sums, axis=0) + rest
     scale = np.outer(*(column_sizes(np.sqrt(np.diag(whole)[:-1])[None, :]),) * 2)
 
     def solved(gram: Array) -> tuple[Array, Array]:
@@ -265,7 +264,7 @@ def by_bands(fit: Fit) -> Array:
         without, wider = solved(whole - two[0] - two[1])
         shift, chance = without - step, np.maximum(wider - variance, _KNOWN * wider)
         moves.append(np.where(shift**2 > _MOST**2 * chance, shift, 0.0))
-    once = np.sqrt(0.5) * problem.magnitude  # each octave is left out twice
+    once = np.sqrt(0.5) * magnitude  # each octave is left out twice
     return np.asarray(np.array(moves).reshape(-1, n) * once)
 
 
@@ -387,12 +386,10 @@ def physical_checks(fit: Fit, spread: Uncertainty, record: Record, *, robust: bo
     theta = fit.problem.parameters(fit.vector)
     sd = dict(zip(spread.names, spread.standard_deviations(robust=robust).tolist(), strict=True))
     wrong = implausible(fit.problem.model, theta, sd)
-    limits = {c.name: find_saturation(record, c.name) for c in record.channels}
     return {
         "identifiable": _identifiable(fit, spread, theta, robust=robust),
         "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical; the coil is passive"),
-        "within_limits": _within_limits(limits),
-        "signals_sound": _signals_sound(record, fit.problem.model.outputs, limits),
+        **signal_checks(record, fit.problem.model.outputs),
     }
 
 
@@ -444,39 +441,8 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
     return texts
 
 
-def _within_limits(saturations: Mapping[str, Saturation]) -> Check:
-    bad = {name: s for name, s in saturations.items() if s.fraction > _SATURATED}
-    detail = ". ".join(f"{s}{': ' + _MISSING[name] if name in _MISSING else ''}" for name, s in bad.items())
-    return Check(
-        passed=not bad,
-        values={f"{name}_fraction": s.fraction for name, s in saturations.items()},
-        detail=f"{detail}. Reduce the excitation, or cut those parts out" if bad else "no saturation",
-    )
-
-
-def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str, Saturation]) -> Check:
-    """Outliers and drop-outs of the measured outputs; an input may rightly stand still or kick."""
-    faults = [
-        (role, fault)
-        for role in outputs
-        for fault in (find_outliers(record, role), find_dropouts(record, role, saturation=limits[role]))
-    ]
-    some = [f"{role}: {f}" for role, f in faults if f.count]
-    most = max(faults, key=lambda fault: fault[1].count)[1]
-    few = max(f.count for _, f in faults) <= _ERRONEOUS * record.n_samples
-    return Check(
-        passed=few,
-        cause="" if few else "stuck" if isinstance(most, Dropouts) else "spikes",
-        values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in faults},
-        detail=f"{'; '.join(some)}. They were used unchanged; replace them (signals.replace_samples) or cut them out"
-        if some
-        else "no outliers or drop-outs in the measured outputs",
-    )
-
-
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
 _NEAR = 0.3  # relative, up to which a calibration may explain it
-_COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
 
@@ -497,7 +463,8 @@ def fact_checks(
     )
     checks = agreements(bench, rig, theta, sd, alone, freed)
     if robust:
-        checks["resolution"] = _resolution(bench, fit)
+        scale = zip(fit.problem.model.outputs, np.diag(fit.covariance) * fit.problem.scales.output**2, strict=True)
+        checks["resolution"] = resolution_check(bench, dict(scale))
     if "position" not in bench:
         return checks
     loop = loop_agrees(rig, theta, bench.rate_hz)
@@ -518,25 +485,6 @@ def fact_checks(
                 "k_x > 0. Check that all columns are of one run, and their signs",
             )  # fmt: skip
     return checks
-
-
-def _resolution(record: Record, fit: Fit) -> Check:
-    """Check that the steps of the converters are small beside the innovations."""
-    problem, text, worst = fit.problem, "", 0.0
-    for k, role in enumerate(problem.model.outputs):
-        step = resolution(record, role).step
-        part = step**2 / 12.0 / (fit.covariance[k, k] * problem.scales.output[k] ** 2)
-        if part > max(worst, _COARSE):
-            worst = float(part)
-            unit = record[role].unit
-            text = (
-                f"the steps of the {role}, {step:.3g} {unit}, make up {100.0 * min(part, 1.0):.2g} % of its innovations"
-            )
-    return Check(
-        passed=not text, values={"part": worst}, cause="quantisation" if text else "",
-        detail=f"{text}, and are no white noise. Use a finer range, or excite more" if text
-        else "the steps of the converters are small beside the innovations",
-    )  # fmt: skip
 
 
 def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:

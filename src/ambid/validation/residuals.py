@@ -158,11 +158,11 @@ def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
     return triangle_of([rows.reshape(n * n_y, -1)])
 
 
-def score_of(triangle: Array, n_directions: int) -> float:
-    """Return p of a test from the triangle of all samples, see `joint_triangle`."""
+def score_of(triangle: Array, n_directions: int) -> tuple[float, float, int]:
+    """Return p, statistic and degrees of a test from the triangle of all samples, see `joint_triangle`."""
     L, rest, _ = _project(triangle, n_directions)
     _, z = _explain(L, rest @ L, _SAME)
-    return chi_squared_tail(z.size, float(z @ z)) if z.size else 1.0
+    return chi_squared_tail(z.size, float(z @ z)) if z.size else 1.0, float(z @ z), z.size
 
 
 def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array | None) -> Score:

@@ -109,7 +109,7 @@ def test_an_eddy_pole_that_is_left_out_shows_in_past_voltages_alone():
     assert abs(fit.problem.values(fit.vector)["m"] / 4.0 - 1.0) > 0.03  # it would be believed
     test = whiteness(fit, 0)
     assert test.p < 1e-6
-    assert test.p_own > 1e-6
+    assert test.own.p > 1e-6
 
 
 def test_a_pole_that_is_not_there_goes_to_its_bound_and_is_not_identifiable():
