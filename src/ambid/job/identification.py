@@ -297,6 +297,7 @@ def _judged(
     causes that the innovations may have, the strongest first.
     """
     from ambid.bearing.columns import check_lag
+    from ambid.bearing.linear import course_left_open
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.calibration import calibrated, linear_moves, lines_of
     from ambid.estimation.likelihood import free_one, innovations, simulation_error
@@ -304,6 +305,9 @@ def _judged(
     from ambid.validation.facts import informed
     from ambid.validation.residuals import fit_of
 
+    between: dict[str, Check] = {}
+    if rig.measured_input:
+        fit, between["current_between_samples"] = course_left_open(fit)
     problem = fit.problem
     means = {role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)}
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
@@ -361,7 +365,7 @@ def _judged(
             facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}
     checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
-    checks |= facts
+    checks |= {**facts, **between}
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(

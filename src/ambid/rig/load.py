@@ -32,6 +32,7 @@ from ambid.rig.rig import (
 )
 from ambid.rig.rotor import modes_of, operation_of, planes_of, rotor_of, shaft_of, si_of, turning_of, unit_of
 from ambid.settings.caller import command, path_of
+from ambid.signals.conditioning import mean_to_next
 from ambid.units import UNKNOWN, parse_unit
 
 if TYPE_CHECKING:
@@ -214,20 +215,33 @@ def _build(file: RigFile, path: Path) -> Rig:
 
 
 def _default_channels(plant: LinearModel) -> tuple[RigChannel, ...]:
-    inputs = tuple(RigChannel(role=role, column=role, delay="auto") for role in plant.inputs)
+    inputs = tuple(RigChannel(role=role, column=role, delay=_usual_delay(role)) for role in plant.inputs)
     return inputs + tuple(RigChannel(role=role, column=role) for role in plant.outputs)
+
+
+def _usual_delay(role: str, *, commanded: bool = False) -> Literal["auto", 0]:
+    """A current that is measured acts when it is; what is commanded acts later."""
+    return 0 if role == "current" and not commanded else "auto"
 
 
 def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Path) -> tuple[RigChannel, ...]:
     """Build the channels in the model's order; refuse unknown and missing roles and a column used twice."""
     units, where = role_units(plant), f"rig {path}"
+    commanded = plant.inputs == ("current",) and "command" in entries
+    if commanded and "current" in entries:
+        raise RigError(
+            f"{where}: [channels.current] is measured and [channels.command] commanded; one of them is the input. Omit "
+            "the other"
+        )
+    if commanded:
+        entries = {"current" if role == "command" else role: entry for role, entry in entries.items()}
     for role in entries:
         if role not in units:
             raise RigError(f"{where}: unknown role [channels.{role}]; model {plant.name!r} has {choices(role, units)}")
     channels = []
     for role in units:
         if role in entries:
-            channels.append(_channel(role, entries[role], units[role], plant, path))
+            channels.append(_channel(role, entries[role], units[role], plant, path, commanded=commanded))
         elif role not in optional_roles(plant):
             raise RigError(
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
@@ -236,26 +250,35 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     for c in channels:
         if c.column in owners:
             raise RigError(
-                f"{where}: column {c.column!r} is both channels.{owners[c.column]} and channels.{c.role};"
+                f"{where}: column {c.column!r} is both channels.{owners[c.column]} and channels.{c.key};"
                 " a column has one role. Correct one"
             )
-        owners[c.column] = c.role
+        owners[c.column] = c.key
     return tuple(channels)
 
 
-def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path) -> RigChannel:
-    place = f"rig {path}: channels.{role}"
+def _channel(
+    role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path, *, commanded: bool
+) -> RigChannel:
+    commanded = commanded and role == "current"
+    key = "command" if commanded else role
+    place = f"rig {path}: channels.{key}"
     if entry.delay == "auto" and role not in plant.inputs:
         raise RigError(
             f"{place}.delay is 'auto'; it can be found for inputs only ({', '.join(plant.inputs)}). Give whole samples"
         )
     return RigChannel(
         role=role,
-        column=entry.column or role,
+        column=entry.column or key,
         unit=unit_of(entry.unit, place).symbol if entry.unit else None,
         calibration=calibration_of(entry, unit, place, path.parent),
-        delay=entry.delay if entry.delay is not None else "auto" if role in plant.inputs else 0,
+        delay=entry.delay
+        if entry.delay is not None
+        else _usual_delay(role, commanded=commanded)
+        if role in plant.inputs
+        else 0,
         variable=entry.variable,
+        commanded=commanded,
         **channel_sd_of(entry, unit, place, known=role in (*plant.inputs, *plant.outputs)),
     )
 
@@ -598,10 +621,10 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     for c in rig.channels:
         if c.column not in record.names:
             remedy = (
-                f"Correct channels.{c.role}.column" if rig.source is not None else f"Let {command('init')} draft a rig"
+                f"Correct channels.{c.key}.column" if rig.source is not None else f"Let {command('init')} draft a rig"
             )
             raise RecordError(
-                f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
+                f"the record has no column {c.column!r} (needed by channels.{c.key}); it has"
                 f" {choices(c.column, record.names)} {remedy}"
             )
     found = {c.role: _in_declared_unit(record.channel(c.column), c, drafting=rig.source is None) for c in rig.channels}
@@ -614,7 +637,8 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
     history = (*record.history, *steps, replace(SELECTED, settings=columns))
     others = (record.channel(name) for name in beside if name not in found)
-    return _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
+    read = _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
+    return mean_to_next(read, "current") if rig.measured_input else read
 
 
 def _taken_back(record: Record, rig: Rig) -> Record:
@@ -660,8 +684,8 @@ def _in_declared_unit(channel: Channel, c: RigChannel, *, drafting: bool = False
         what = f"is in [{channel.source_unit}], an unknown unit" if unknown else "has no unit"
         drafted = f" in the rig that {command('init')} drafts" if drafting else ""
         raise UnitError(
-            f"column {channel.name!r} {what} (needed by channels.{c.role}). Write '{channel.name} [unit]' in the header"
-            f" ([1] for a plain number), or give channels.{c.role}.unit{drafted}"
+            f"column {channel.name!r} {what} (needed by channels.{c.key}). Write '{channel.name} [unit]' in the header"
+            f" ([1] for a plain number), or give channels.{c.key}.unit{drafted}"
         )
     return channel
 
@@ -689,7 +713,7 @@ def _calibrated(channel: Channel, c: RigChannel, unit: str) -> tuple[Channel, St
         if channel.unit != unit != UNKNOWN:
             raise UnitError(
                 f"column {channel.name!r} is in [{channel.source_unit}]; the rig needs a {c.role} in [{unit}]."
-                f" Fix the header, or give channels.{c.role}.gain or table"
+                f" Fix the header, or give channels.{c.key}.gain or table"
             )
         return channel, None
     # A gain is per SI unit of whatever the column is in, so its input unit is known only now.
