@@ -65,8 +65,10 @@ _GROWING = {
 """Causes whose signals are known but for their sizes."""
 _KNOWN = {"fixed_value", "sensor_gain", "rate"}
 """Causes in what the rig says."""
-_OPPOSING = {"dead_time", "friction"}
+_OPPOSING = {"dead_time", "friction", "amplifier_lag", "current_sensor_pole"}
 """Causes that physics gives a sign."""
+_LAGS = {"eddy_pole", "sensor_lag"}
+"""Causes that another is named for where they lead: the current is late then, and the delay has followed it."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
@@ -145,8 +147,15 @@ def causes(
     if thorough:
         found += _colours(spectra, _ways(look, slice(None)), rate_hz, fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
+    turned = {"name": "current_lag", "channel": "current"}
+    found = [replace(c, **turned, size=-c.size) if c.name in _LAGS and c.size < 0.0 else c for c in found]
+    late = next((c for c in found if c.name == "current_lag"), None)
     return [
-        c for c in found if (c.name != "slow_current" or c is found[0]) and not (c.name in _OPPOSING and c.size < 0.0)
+        c
+        for c in found
+        if (c.name != "slow_current" or c is found[0])
+        and not (c.name in _OPPOSING and c.size < 0.0)
+        and (c.name != "current_lag" or c is late)
     ]
 
 
