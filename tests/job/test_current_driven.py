@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import ambid
@@ -90,6 +91,27 @@ def test_a_second_record_and_a_track_see_the_current_as_the_estimate_does(tmp_pa
     last = track.lines[-1].parameters
     assert track.verdict.word == "usable"
     assert all(abs(last[name].value - theta[name]) < 4.0 * last[name].sd for name in ("k_x", "k_i"))
+
+
+def test_what_the_model_leaves_out_is_named_or_taken_in():
+    columns, rate_hz, theta = of_coil("rmit-axis", 1)
+    text = rig("current", theta).replace('unit = "N s/m"', 'unit = "N s/m", role = "fixed"')
+    other = of_coil("rmit-axis", 2)[0]["position"]
+    x, i = columns["position"], columns["current"]
+    hum = 0.1 * x.std() * np.sin(2.0 * np.pi * 53.7 * np.arange(x.size) / rate_hz)
+
+    def found(current, position):
+        return ambid.identify({"current": current, "position": position}, text, rate_hz=rate_hz, units=UNITS)
+
+    with_line, late, apart = found(i, x + hum), found(0.5 * (i + np.roll(i, 1)), x), found(i, other)
+    assert with_line.verdict.word == "usable"
+    assert with_line.extended == ("line (53.7 Hz)",)
+    assert all(abs(with_line[name].value - theta[name]) < 4.0 * with_line[name].sd for name in ("k_x", "k_i"))
+    assert late.checks["causes"].cause == "current_lag"
+    assert late.checks["causes"].size == pytest.approx(0.5 / rate_hz, rel=0.3)
+    assert apart.verdict.word == "unusable"
+    assert apart.checks["belonging"].cause == "belonging"
+    assert not {"ohm", "sampling", "in_time", "loop_agrees"} & with_line.checks.keys()
 
 
 def test_a_rig_keeps_what_drives_it():

@@ -120,7 +120,7 @@ def causes(
     fit: Fit, means: Mapping[str, float], rig: Rig, *, thorough: bool, delay_given: bool = False,
     freed: Freed | None = None,
 ) -> list[Cause]:  # fmt: skip
-    """Return the causes that the innovations of model one-axis or coil may have, the strongest first.
+    """Return the causes that the innovations of a model of one axis may have, the strongest first.
 
     `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed;
     `delay_given`: the delay of the voltage was not estimated; `freed`: what `free_one` says of each fixed value, where
@@ -134,7 +134,7 @@ def causes(
     lines = _lines(look)
     top_hz = _top(spectra, lines) * rate_hz / course.t.size if thorough else 0.0
     groups = list(groups_of(course, top_hz, thorough=thorough))
-    if delay_given:
+    if delay_given and "voltage" in course.channels:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
     groups += [("line", _waving(lines, course.t.size))] if lines else []
@@ -147,8 +147,10 @@ def causes(
     if thorough:
         found += _colours(spectra, _ways(look, slice(None)), rate_hz, fit.problem.n_physical)
     found.sort(key=_net)  # a current that drifts acts as force and voltage together, and explains much of either
-    turned = {"name": "current_lag", "channel": "current"}
-    found = [replace(c, **turned, size=-c.size) if c.name in _LAGS and c.size < 0.0 else c for c in found]
+    found = [
+        replace(c, name="current_lag", channel="current", size=-c.size) if c.name in _LAGS and c.size < 0.0 else c
+        for c in found
+    ]
     late = next((c for c in found if c.name == "current_lag"), None)
     return [
         c
@@ -338,12 +340,15 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> C
     problem, model = fit.problem, fit.problem.model
     columns = [model.states.index(n) if n in model.states else -1 for n in ("position", "velocity", "current")]
     x, v, i = (states[:, k] * problem.scales.state[k] if k >= 0 else np.zeros(len(states)) for k in columns)
-    theta, delay = {"k_i": 0.0, **problem.parameters(fit.vector)}, problem.delay_samples(fit.vector)
+    theta = {"k_i": 0.0, "R": 0.0, "L": 1.0, **problem.parameters(fit.vector)}
+    delay = problem.delay_samples(fit.vector)
     whole = int(np.floor(delay))
-    first = problem.skip + at.start - whole - 2
-    raw = problem.u[np.maximum(np.arange(first, first + x.size + 2), 0), 0]
-    held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from one before on
-    rest, u, last = theta["R"] * i + theta["k_i"] * v, held[1:], held[:-1]
+    first = problem.skip + at.start - whole - 3
+    raw = problem.u[np.maximum(np.arange(first, first + x.size + 3), 0), 0]
+    held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from two before on
+    rest, u, last = theta["R"] * i + theta["k_i"] * v, held[2:], held[1:-1]
+    if model.inputs == ("current",):  # at each sample, by the means before it
+        i = 1.5 * last - 0.5 * held[:-2]
     return Course(
         t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
         before=(last - rest) / theta["L"],
@@ -581,6 +586,8 @@ def causes_check(
     first = sure[0]
     alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
     same = [n for n in SAME_AS.get(first.name, ()) if n != "sensor_lag" or record is None or "position" in record]
+    if first.name == "eddy_pole" and record is not None and "voltage" not in record:
+        same = ["sensor_lag", "sensor_pole"]  # a force that lags and a position that does are the same to an input
     others = tuple(dict.fromkeys([*alike, *same]))
     if not checks["estimates_agree"].passed and between_samples(record):
         others = (*others, "sampling")
