@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.errors import RigError
+from ambid.errors import RecordError, RigError
 from ambid.physics.presets import preset
-from ambid.rig import rig_from_text, rig_text
+from ambid.rig import read_bench, rig_from_text, rig_text
 
 RIG = """schema = "ambid.rig/1"
 model = "rotor"
@@ -119,6 +119,11 @@ def test_a_rig_keeps_what_drives_it():
     told = rig_from_text(rig("command", theta), "rig.toml")
     assert told.channel("current").commanded
     assert told.channel("current").delay == "auto"
+    measured, squares = rig_from_text(rig("current", theta), "rig.toml"), np.arange(10.0) ** 2
+    record = read_bench({"current": squares, "position": np.zeros(10)}, measured, rate_hz=1e3, units=UNITS)
+    assert read_bench(record, measured)["current"].values[4] == pytest.approx(20.0 + 1.0 / 3.0)
+    with pytest.raises(RecordError, match="read with a measured current"):
+        read_bench(record, told)
     assert rig_from_text(rig_text(told, Path()), "rig.toml").channels == told.channels
     assert rig_from_text(rig("current", theta), "rig.toml").channel("current").delay == 0
     both = rig("command", theta).replace("[channels.position]", '[channels.current]\ncolumn = "i"\n[channels.position]')

@@ -215,33 +215,26 @@ def _build(file: RigFile, path: Path) -> Rig:
 
 
 def _default_channels(plant: LinearModel) -> tuple[RigChannel, ...]:
-    inputs = tuple(RigChannel(role=role, column=role, delay=_usual_delay(role)) for role in plant.inputs)
+    inputs = tuple(RigChannel(role=x, column=x, delay=0 if x == "current" else "auto") for x in plant.inputs)
     return inputs + tuple(RigChannel(role=role, column=role) for role in plant.outputs)
-
-
-def _usual_delay(role: str, *, commanded: bool = False) -> Literal["auto", 0]:
-    """A current that is measured acts when it is; what is commanded acts later."""
-    return 0 if role == "current" and not commanded else "auto"
 
 
 def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Path) -> tuple[RigChannel, ...]:
     """Build the channels in the model's order; refuse unknown and missing roles and a column used twice."""
     units, where = role_units(plant), f"rig {path}"
-    commanded = plant.inputs == ("current",) and "command" in entries
-    if commanded and "current" in entries:
+    keys = {"current" if key == "command" and plant.inputs == ("current",) else key: key for key in entries}
+    if len(keys) < len(entries):
         raise RigError(
             f"{where}: [channels.current] is measured and [channels.command] commanded; one of them is the input. Omit "
             "the other"
         )
-    if commanded:
-        entries = {"current" if role == "command" else role: entry for role, entry in entries.items()}
-    for role in entries:
+    for role in keys:
         if role not in units:
             raise RigError(f"{where}: unknown role [channels.{role}]; model {plant.name!r} has {choices(role, units)}")
     channels = []
     for role in units:
-        if role in entries:
-            channels.append(_channel(role, entries[role], units[role], plant, path, commanded=commanded))
+        if role in keys:
+            channels.append(_channel(role, keys[role], entries[keys[role]], units[role], plant, path))
         elif role not in optional_roles(plant):
             raise RigError(
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
@@ -257,12 +250,8 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     return tuple(channels)
 
 
-def _channel(
-    role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path, *, commanded: bool
-) -> RigChannel:
-    commanded = commanded and role == "current"
-    key = "command" if commanded else role
-    place = f"rig {path}: channels.{key}"
+def _channel(role: str, key: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path) -> RigChannel:
+    place, acts_later = f"rig {path}: channels.{key}", role in plant.inputs and key != "current"
     if entry.delay == "auto" and role not in plant.inputs:
         raise RigError(
             f"{place}.delay is 'auto'; it can be found for inputs only ({', '.join(plant.inputs)}). Give whole samples"
@@ -272,13 +261,9 @@ def _channel(
         column=entry.column or key,
         unit=unit_of(entry.unit, place).symbol if entry.unit else None,
         calibration=calibration_of(entry, unit, place, path.parent),
-        delay=entry.delay
-        if entry.delay is not None
-        else _usual_delay(role, commanded=commanded)
-        if role in plant.inputs
-        else 0,
+        delay=entry.delay if entry.delay is not None else "auto" if acts_later else 0,
         variable=entry.variable,
-        commanded=commanded,
+        commanded=key != role,
         **channel_sd_of(entry, unit, place, known=role in (*plant.inputs, *plant.outputs)),
     )
 
@@ -617,7 +602,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     """
     wanted = role_units(rig.plant)
     if any(step.name == SELECTED.name for step in record.history):
-        return _through_a_rig(record, rig, wanted)
+        return _as_it_acts(_through_a_rig(record, rig, wanted), rig)
     for c in rig.channels:
         if c.column not in record.names:
             remedy = (
@@ -637,8 +622,18 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
     history = (*record.history, *steps, replace(SELECTED, settings=columns))
     others = (record.channel(name) for name in beside if name not in found)
-    read = _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
-    return mean_to_next(read, "current") if rig.measured_input else read
+    return _as_it_acts(_taken_back(replace(record, channels=(*channels, *others), history=history), rig), rig)
+
+
+def _as_it_acts(record: Record, rig: Rig) -> Record:
+    """Let a measured current that drives one axis be held at its mean from each sample to the next."""
+    taken = any(step.name == "mean_to_next" for step in record.history)
+    if taken and not rig.measured_input:
+        raise RecordError(
+            "the record was read with a measured current; this rig's is commanded, or drives nothing. Read it again, "
+            "through this rig"
+        )
+    return record if taken or not rig.measured_input else mean_to_next(record, "current")
 
 
 def _taken_back(record: Record, rig: Rig) -> Record:
