@@ -114,6 +114,18 @@ def test_what_the_model_leaves_out_is_named_or_taken_in():
     assert not {"ohm", "sampling", "in_time", "loop_agrees"} & with_line.checks.keys()
 
 
+def test_a_lag_of_a_sample_is_named_and_not_taken_in_by_its_first_order():
+    columns, rate_hz, theta = of_coil("rmit-axis", 1)
+    columns["position"] = np.append(columns["position"][0], columns["position"][:-1])
+    found = ambid.identify(columns, rig("current", theta), rate_hz=rate_hz, units=UNITS)
+    assert found.verdict.word == "caution"
+    assert not found.extended
+    named = found.checks["causes"]
+    assert {"sensor_lag", "eddy_pole"} <= {named.cause, *named.alternatives}
+    assert named.size * rate_hz > 0.5
+    assert all(abs(found[name].value - theta[name]) < 4.0 * found[name].sd for name in ("k_x", "k_i"))
+
+
 def test_a_rig_keeps_what_drives_it():
     theta = {"m": 0.1, "k_x": -8.7e4, "k_i": 20.0}
     told = rig_from_text(rig("command", theta), "rig.toml")

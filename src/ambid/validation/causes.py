@@ -69,6 +69,7 @@ _OPPOSING = {"dead_time", "friction", "amplifier_lag", "current_sensor_pole"}
 """Causes that physics gives a sign."""
 _LAGS = {"eddy_pole", "sensor_lag"}
 """Causes that another is named for where they lead: the current is late then, and the delay has followed it."""
+_LATEST = 0.5  # samples of a lag that its first order explains
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
@@ -229,7 +230,8 @@ def extended(
     strong = [c for c in sure if c.gain > _ALIKE * sure[0].gain]
     if doubtful:
         strong = [c for c in strong if c.name in _IN_TIME]
-    if not strong or any(c.name not in _GROWING for c in strong):
+    late = max((c.size * fit.problem.rate_hz for c in strong if c.name in _LAGS), default=0.0)
+    if not strong or late > _LATEST or any(c.name not in _GROWING for c in strong):
         return None
     cause, more = strong[0], None
     alike = {(c.name, c.channel): c for c in reversed(strong) if c.name not in _NOISE}
