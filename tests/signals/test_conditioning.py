@@ -7,6 +7,7 @@ import pytest
 
 from ambid.errors import RecordError
 from ambid.signals import cut, remove_trend, replace_samples, resample
+from ambid.signals.conditioning import mean_to_next
 
 RATE = 1000.0
 T = np.arange(4000) / RATE
@@ -112,3 +113,10 @@ def test_upsampling_is_refused(make):
 def test_resampling_to_an_irrational_ratio_is_refused(make):
     with pytest.raises(RecordError, match="fraction"):
         resample(make(RATE, x=sine(20)), 1000.0 / np.pi)
+
+
+def test_the_mean_to_the_next_sample_is_that_of_a_polynomial(make):
+    k = np.arange(12.0)
+    record = mean_to_next(make(1.0, x=0.3 * k**4 - 2.0 * k**2 + k), "x")
+    whole = 0.06 * k**5 - 2.0 / 3.0 * k**3 + 0.5 * k**2
+    np.testing.assert_allclose(record["x"].values[3:-1], np.diff(whole)[3:], rtol=1e-12)

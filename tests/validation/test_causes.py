@@ -96,6 +96,19 @@ def test_the_cause_is_named(preset, spoil, cause, channel):
         assert sure[0].size == pytest.approx(50.0, abs=1.0)
 
 
+def test_a_current_that_is_late_by_a_part_of_a_sample_is_named_with_its_lag():
+    """No force leads its current: where one would have to, the current is late, and the delay has followed it."""
+    columns, rate_hz = columns_of("levitated-ball", 1, 4.0)
+    k, part = np.arange(-40, 41), 0.3
+    ahead = np.sinc(k - part) * np.kaiser(81, 8.0)
+    columns["current"] = np.convolve(np.pad(columns["current"], 40, mode="edge"), ahead / ahead.sum(), "valid")
+    found = strongest(columns, rate_hz)
+    lag = next(c for c in found if c.name == "current_lag")
+    assert lag.gain > 0.7 * found[0].gain
+    assert 0.5 * part < lag.size * rate_hz < 1.5 * part
+    assert not any(c.name in ("eddy_pole", "sensor_lag", "amplifier_lag") and c.size < 0.0 for c in found)
+
+
 def test_a_delay_that_is_given_wrong_is_named():
     columns, rate_hz = columns_of("unstable-bearing", 1)
     columns["voltage"] = np.concatenate([columns["voltage"][1:], columns["voltage"][-1:]])  # acts a sample later now

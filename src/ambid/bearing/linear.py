@@ -19,6 +19,7 @@ from ambid.bearing.columns import POOR, late, refuse_mistaken, refuse_silent
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, rescue
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import (
     Fit,
     Workspace,
@@ -29,11 +30,13 @@ from ambid.estimation.likelihood import (
     search,
     workspace_near,
 )
-from ambid.estimation.linear import one_thread
+from ambid.estimation.linear import directions, one_thread
 from ambid.estimation.predictor import PredictorProblem, assemble, stable
 from ambid.physics.linear_model import LinearModel, Parameter
 
 _LOOK = 3  # steps of a search with which another delay is looked at
+_SECOND = np.array([2.0, -5.0, 4.0, -1.0]) / 12.0  # of this sample and those before: second difference over 12
+_FAR = 5.0  # standard deviations that the course between samples may move a number by
 
 
 def greybox(
@@ -317,3 +320,25 @@ def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit
         return fit
     freed = search(free, carry(fit, free), tick=tick, work=workspace_near(fit, free))
     return freed if force or fit.criterion - freed.criterion > price else fit
+
+
+def course_left_open(fit: Fit) -> tuple[Fit, Check]:
+    """Return a fit on a measured current with what its course between samples leaves open, and the check of that.
+
+    The current is taken as straight between samples, as the voltage of a coil that is held makes it. A smooth one acts
+    as if its second difference over 12 were taken off (position, of a force that is held at its mean): how far the
+    numbers move then is part of their intervals.
+    """
+    problem, n = fit.problem, fit.problem.n_physical
+    u = np.concatenate([np.repeat(problem.u[:1], 3), problem.u[:, 0]])
+    smooth = replace(problem, u=problem.u - np.convolve(u, _SECOND, "valid")[:, None])
+    move = (search(smooth, fit.vector, work=workspace_near(fit, smooth)).vector - fit.vector)[:n]
+    sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n])
+    worst = int(np.argmax(np.abs(move) / sd))
+    z = float(abs(move[worst]) / sd[worst])
+    more = np.outer(move, move)
+    return replace(fit, beside=more if fit.beside is None else fit.beside + more), Check(
+        passed=z <= _FAR, values={"z": z}, cause="" if z <= _FAR else "sampling",
+        detail=f"a current that is smooth between samples, and not straight, moves {problem.estimated[worst]} by "
+        f"{z:.2g} sd of the record: the intervals hold it{'' if z <= _FAR else '. Sample faster'}",
+    )  # fmt: skip

@@ -295,13 +295,18 @@ def _judged(
     causes that the innovations may have, the strongest first.
     """
     from ambid.bearing.columns import check_lag
+    from ambid.bearing.linear import course_left_open
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.calibration import calibrated, linear_moves, lines_of
     from ambid.estimation.likelihood import free_one, innovations, simulation_error
     from ambid.validation import physical
+    from ambid.validation.causes import causes, causes_check, named_bias
     from ambid.validation.facts import informed
     from ambid.validation.residuals import fit_of
 
+    between: dict[str, Check] = {}
+    if rig.measured_input:
+        fit, between["current_between_samples"] = course_left_open(fit)
     problem = fit.problem
     means = {role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)}
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
@@ -318,48 +323,42 @@ def _judged(
     freed = {name: free_one(fit, name) for name in problem.known}
     checks |= physical.assumption_checks(fit, spread, freed, delay_how)
     signals = signals_of(bench, problem.model)
-    named: list[Cause] = []
-    axis, coil = (problem.model.name == name for name in ("one-axis", "coil"))
-    if axis or coil:
-        from ambid.validation.causes import causes, causes_check, named_bias
+    axis = problem.model.name == "one-axis"
+    in_time = {"in_time": check_lag(signals)} if axis else {}
+    curved, bent, own = None, False, np.sqrt(np.diag(spread.information))
+    if axis and (rig.magnet is not None or rig.limits is not None):  # else no law of the magnet is known
+        from ambid.control.curvature import magnet_checks
+        from ambid.control.experiment import MOST
 
-        in_time = {"in_time": check_lag(signals)} if axis else {}
-        curved, bent, own = None, False, np.sqrt(np.diag(spread.information))
-        if axis and (rig.magnet is not None or rig.limits is not None):  # else no law of the magnet is known
-            from ambid.control.curvature import magnet_checks
-            from ambid.control.experiment import MOST
-
-            by_refits = replace(spread, disagreement=spread.disagreement[:1])  # bands bend too
-            sd = by_refits.standard_deviations(robust=robust)
-            checks |= magnet_checks(fit, e, rig, means, sd)
-            curved = checks.get("curvature")
-        if curved is not None:
-            shift = np.array([curved.values[name] for name in spread.names])
-            bent = bool(np.any(np.abs(shift) > MOST))  # a law says more than powers of the motion
-            spread = replace(spread, bias=shift * sd) if bent else spread
-        before, given = dict(checks), delay_how == "given"
-        for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
-            named = [
-                c
-                for c in causes(fit, means, rig, thorough=thorough, delay_given=given, freed=freed)
-                if not bent or c.name != "curvature"
-            ]
-            judged = causes_check(named, {**before, **in_time}, own, robust=robust, record=bench)
-            checks = {**before, **judged, **in_time}
-            if checks["causes"].passed:
-                break
-        spread = replace(spread, bias=named_bias(named, spread.bias))
-    facts: Mapping[str, Check] = {}
-    used, alone = None, spread.information
-    if axis or coil:
-        facts = physical.fact_checks(fit, rig, bench, spread, robust=robust, freed=freed)
-        fit, spread, used = informed(fit, rig, bench, {**checks, **facts}, spread, robust=robust)
-        if used is not None:
-            text = f"{facts['gravity_balance'].detail}. The estimate uses it"
-            facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}
+        by_refits = replace(spread, disagreement=spread.disagreement[:1])  # bands bend too
+        sd = by_refits.standard_deviations(robust=robust)
+        checks |= magnet_checks(fit, e, rig, means, sd)
+        curved = checks.get("curvature")
+    if curved is not None:
+        shift = np.array([curved.values[name] for name in spread.names])
+        bent = bool(np.any(np.abs(shift) > MOST))  # a law says more than powers of the motion
+        spread = replace(spread, bias=shift * sd) if bent else spread
+    before, given = dict(checks), delay_how == "given"
+    for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
+        named = [
+            c
+            for c in causes(fit, means, rig, thorough=thorough, delay_given=given, freed=freed)
+            if not bent or c.name != "curvature"
+        ]
+        judged = causes_check(named, {**before, **in_time}, own, robust=robust, record=bench)
+        checks = {**before, **judged, **in_time}
+        if checks["causes"].passed:
+            break
+    spread = replace(spread, bias=named_bias(named, spread.bias))
+    alone = spread.information
+    facts = physical.fact_checks(fit, rig, bench, spread, robust=robust, freed=freed)
+    fit, spread, used = informed(fit, rig, bench, {**checks, **facts}, spread, robust=robust)
+    if used is not None:
+        text = f"{facts['gravity_balance'].detail}. The estimate uses it"
+        facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}
     checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
-    checks |= facts
+    checks |= {**facts, **between}
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(

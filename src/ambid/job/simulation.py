@@ -211,7 +211,7 @@ def simulate_used(
             return bench.simulate(waves, seed=seed, settle=sets_in), excited
         refuse_given({"settle": settle}, f"{setting('excitation')} is an experiment, which takes no {{}}. Omit {{}}")
         wave = experiment.played(n, bench.rate_hz, closed=bench.loop.closed)[:, 0]
-        return _with_excitation(bench.simulate(wave, seed=seed), wave if log_excitation else None), Excited(
+        return _noted(bench.simulate(wave, seed=seed), bench.rig, wave if log_excitation else None), Excited(
             kind="experiment", peak=float(np.max(np.abs(wave)))
         )
     if amplitude is None and bench.rig is not None and bench.rig.limits is None:
@@ -237,7 +237,7 @@ def simulate_used(
     )
     peak = bench.largest(shape, seed, FRACTION) if amplitude is None else amplitude
     done = bench.simulate(peak * shape, seed=seed)
-    return _with_excitation(done, peak * shape if log_excitation else None), Excited(kind=kind, peak=peak)
+    return _noted(done, bench.rig, peak * shape if log_excitation else None), Excited(kind=kind, peak=peak)
 
 
 def speeds_of(run_up: str | Sequence[float]) -> tuple[float, ...]:
@@ -278,8 +278,11 @@ def _run_up(
     return bench.run_up(course, n, seed=seed, settle=round(_BEFORE_S * bench.rate_hz)), Excited(kind=words, peak=0.0)
 
 
-def _with_excitation(done: Simulation, wave: Array | None) -> Simulation:
-    """Add a column of the excitation, where it is to be logged."""
+def _noted(done: Simulation, rig: Rig | None, wave: Array | None) -> Simulation:
+    """Add a column of the excitation, where it is to be logged, and what the rig would read wrongly."""
+    if rig is not None and rig.measured_input:
+        text = "the current of this record is a command, held over each sample, and the rig's is measured. Read it with"
+        done = replace(done, notes=(f"{text} [channels.command] in place of [channels.current]",))
     if wave is None:
         return done
     logged = Channel(name="excitation", unit="V", values=wave)

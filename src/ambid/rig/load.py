@@ -32,6 +32,7 @@ from ambid.rig.rig import (
 )
 from ambid.rig.rotor import modes_of, operation_of, planes_of, rotor_of, shaft_of, si_of, turning_of, unit_of
 from ambid.settings.caller import command, path_of
+from ambid.signals.conditioning import mean_to_next
 from ambid.units import UNKNOWN, parse_unit
 
 if TYPE_CHECKING:
@@ -214,20 +215,26 @@ def _build(file: RigFile, path: Path) -> Rig:
 
 
 def _default_channels(plant: LinearModel) -> tuple[RigChannel, ...]:
-    inputs = tuple(RigChannel(role=role, column=role, delay="auto") for role in plant.inputs)
+    inputs = tuple(RigChannel(role=x, column=x, delay=0 if x == "current" else "auto") for x in plant.inputs)
     return inputs + tuple(RigChannel(role=role, column=role) for role in plant.outputs)
 
 
 def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Path) -> tuple[RigChannel, ...]:
     """Build the channels in the model's order; refuse unknown and missing roles and a column used twice."""
     units, where = role_units(plant), f"rig {path}"
-    for role in entries:
+    keys = {"current" if key == "command" and plant.inputs == ("current",) else key: key for key in entries}
+    if len(keys) < len(entries):
+        raise RigError(
+            f"{where}: [channels.current] is measured and [channels.command] commanded; one of them is the input. Omit "
+            "the other"
+        )
+    for role in keys:
         if role not in units:
             raise RigError(f"{where}: unknown role [channels.{role}]; model {plant.name!r} has {choices(role, units)}")
     channels = []
     for role in units:
-        if role in entries:
-            channels.append(_channel(role, entries[role], units[role], plant, path))
+        if role in keys:
+            channels.append(_channel(role, keys[role], entries[keys[role]], units[role], plant, path))
         elif role not in optional_roles(plant):
             raise RigError(
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
@@ -236,26 +243,27 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     for c in channels:
         if c.column in owners:
             raise RigError(
-                f"{where}: column {c.column!r} is both channels.{owners[c.column]} and channels.{c.role};"
+                f"{where}: column {c.column!r} is both channels.{owners[c.column]} and channels.{c.key};"
                 " a column has one role. Correct one"
             )
-        owners[c.column] = c.role
+        owners[c.column] = c.key
     return tuple(channels)
 
 
-def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path) -> RigChannel:
-    place = f"rig {path}: channels.{role}"
+def _channel(role: str, key: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path) -> RigChannel:
+    place, acts_later = f"rig {path}: channels.{key}", role in plant.inputs and key != "current"
     if entry.delay == "auto" and role not in plant.inputs:
         raise RigError(
             f"{place}.delay is 'auto'; it can be found for inputs only ({', '.join(plant.inputs)}). Give whole samples"
         )
     return RigChannel(
         role=role,
-        column=entry.column or role,
+        column=entry.column or key,
         unit=unit_of(entry.unit, place).symbol if entry.unit else None,
         calibration=calibration_of(entry, unit, place, path.parent),
-        delay=entry.delay if entry.delay is not None else "auto" if role in plant.inputs else 0,
+        delay=entry.delay if entry.delay is not None else "auto" if acts_later else 0,
         variable=entry.variable,
+        commanded=key != role,
         **channel_sd_of(entry, unit, place, known=role in (*plant.inputs, *plant.outputs)),
     )
 
@@ -594,14 +602,14 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     """
     wanted = role_units(rig.plant)
     if any(step.name == SELECTED.name for step in record.history):
-        return _through_a_rig(record, rig, wanted)
+        return _as_it_acts(_through_a_rig(record, rig, wanted), rig)
     for c in rig.channels:
         if c.column not in record.names:
             remedy = (
-                f"Correct channels.{c.role}.column" if rig.source is not None else f"Let {command('init')} draft a rig"
+                f"Correct channels.{c.key}.column" if rig.source is not None else f"Let {command('init')} draft a rig"
             )
             raise RecordError(
-                f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
+                f"the record has no column {c.column!r} (needed by channels.{c.key}); it has"
                 f" {choices(c.column, record.names)} {remedy}"
             )
     found = {c.role: _in_declared_unit(record.channel(c.column), c, drafting=rig.source is None) for c in rig.channels}
@@ -614,7 +622,18 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
     history = (*record.history, *steps, replace(SELECTED, settings=columns))
     others = (record.channel(name) for name in beside if name not in found)
-    return _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
+    return _as_it_acts(_taken_back(replace(record, channels=(*channels, *others), history=history), rig), rig)
+
+
+def _as_it_acts(record: Record, rig: Rig) -> Record:
+    """Let a measured current that drives one axis be held at its mean from each sample to the next."""
+    taken = any(step.name == "mean_to_next" for step in record.history)
+    if taken and not rig.measured_input:
+        raise RecordError(
+            "the record was read with a measured current; this rig's is commanded, or drives nothing. Read it again, "
+            "through this rig"
+        )
+    return record if taken or not rig.measured_input else mean_to_next(record, "current")
 
 
 def _taken_back(record: Record, rig: Rig) -> Record:
@@ -660,8 +679,8 @@ def _in_declared_unit(channel: Channel, c: RigChannel, *, drafting: bool = False
         what = f"is in [{channel.source_unit}], an unknown unit" if unknown else "has no unit"
         drafted = f" in the rig that {command('init')} drafts" if drafting else ""
         raise UnitError(
-            f"column {channel.name!r} {what} (needed by channels.{c.role}). Write '{channel.name} [unit]' in the header"
-            f" ([1] for a plain number), or give channels.{c.role}.unit{drafted}"
+            f"column {channel.name!r} {what} (needed by channels.{c.key}). Write '{channel.name} [unit]' in the header"
+            f" ([1] for a plain number), or give channels.{c.key}.unit{drafted}"
         )
     return channel
 
@@ -689,7 +708,7 @@ def _calibrated(channel: Channel, c: RigChannel, unit: str) -> tuple[Channel, St
         if channel.unit != unit != UNKNOWN:
             raise UnitError(
                 f"column {channel.name!r} is in [{channel.source_unit}]; the rig needs a {c.role} in [{unit}]."
-                f" Fix the header, or give channels.{c.role}.gain or table"
+                f" Fix the header, or give channels.{c.key}.gain or table"
             )
         return channel, None
     # A gain is per SI unit of whatever the column is in, so its input unit is known only now.

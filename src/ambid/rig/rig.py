@@ -58,6 +58,9 @@ class RigChannel:
     gain_sd, offset_sd : float or None
         How well its calibration is known: standard deviations of the gain, relative, and of the offset in the role's
         SI unit; None: nothing is said of it.
+    commanded : bool
+        Of the current that drives one axis: whether it is the command, held over each sample (``[channels.command]``),
+        or measured, and then linear between samples.
     """
 
     role: str
@@ -68,6 +71,12 @@ class RigChannel:
     variable: str | None = None
     gain_sd: float | None = None
     offset_sd: float | None = None
+    commanded: bool = False
+
+    @property
+    def key(self) -> str:
+        """Its name in a rig file."""
+        return "command" if self.commanded else self.role
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -324,6 +333,11 @@ class Rig:
         columns = ", ".join(f"{c.role} from {c.column!r}" for c in self.channels)
         return f"<Rig {self.name!r}, model {self.model}: {columns}; fixed: {fixed or 'nothing'}>"
 
+    @property
+    def measured_input(self) -> bool:
+        """Whether a measured current drives one axis, so that it is not held between samples."""
+        return self.plant.inputs == ("current",) and not self.channel("current").commanded
+
     def channel(self, role: str) -> RigChannel:
         """Return the channel of a role.
 
@@ -522,7 +536,7 @@ def _channel_lines(c: RigChannel, folder: Path, *, is_input: bool) -> list[str]:
         **(_calibration_entries(c.calibration, c.role, folder) if c.calibration else {}),
         "delay": c.delay if is_input or c.delay else None, "gain_sd": c.gain_sd, "offset_sd": c.offset_sd,
     }  # fmt: skip
-    return [f"[channels.{c.role}]", *toml_lines(entries)]
+    return [f"[channels.{c.key}]", *toml_lines(entries)]
 
 
 def _calibration_entries(calibration: Calibration, role: str, folder: Path) -> dict[str, object]:

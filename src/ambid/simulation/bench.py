@@ -53,6 +53,8 @@ class Simulation:
         Number of samples with the true current outside its limits.
     largest_pole : float
         Largest modulus of the sampled (linearised) loop's poles; the loop is unstable above 1.
+    notes : tuple of str
+        What else a user should know.
     """
 
     record: Record
@@ -64,6 +66,7 @@ class Simulation:
     n_saturated: int
     n_over_current: int
     largest_pole: float
+    notes: tuple[str, ...] = ()
 
     @property
     def within_limits(self) -> bool:
@@ -87,7 +90,7 @@ class Simulation:
             )
         if self.n_over_current:
             warnings.append(f"the current was beyond its limits in {self.n_over_current} samples")
-        return tuple(warnings)
+        return (*warnings, *self.notes)
 
 
 def simulate(

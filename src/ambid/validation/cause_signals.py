@@ -135,7 +135,7 @@ SAME_AS = {
     "sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",), "coloured_force": ("line",),
     "coloured_voltage": ("line",), "coloured_position": ("line",), "coloured_current": ("line",),
     "amplifier_lag": ("limiter", "current_sensor_pole"),
-    "cross_talk": ("sensor_lag", "current_lag"),
+    "cross_talk": ("sensor_lag", "current_lag"), "current_lag": ("current_sensor_pole",),
 }  # fmt: skip
 """What the first order of a score does not distinguish."""
 TEXT = {
@@ -144,6 +144,8 @@ TEXT = {
     "input_delay": "the voltage acts {size:.3g} s later than said. Leave channels.voltage.delay open, or give it",
     "sensor_lag": "the position is logged {size:.3g} s late: a filter of its sensor. Log without it, or say the delay",
     "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
+    "current_lag": "the current is logged {size:.3g} s later than the position: a converter that samples in turn, or a "
+    "filter of its sensor. Sample both at one instant",
     "cross_talk": "the {channel} holds a part of voltage or current: cross-talk, or it is logged a sample after the "
     "voltage that answers it. Check cables, grounds, and that all channels are of one instant",
     "r_drift": "the resistance drifts by {size:.3g} ohm from the middle to the end of the record, or of the busiest "

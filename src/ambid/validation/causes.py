@@ -67,12 +67,15 @@ _GROWING = {
 """Causes whose signals are known but for their sizes."""
 _KNOWN = {"fixed_value", "sensor_gain", "rate"}
 """Causes in what the rig says."""
-_OPPOSING = {"dead_time", "friction"}
+_OPPOSING = {"dead_time", "friction", "amplifier_lag", "current_sensor_pole"}
 """Causes that physics gives a sign."""
 _OF_THE_MODEL = {
     "causes", "residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree",
 }  # fmt: skip
 """Checks that an extension has to pass: those that asked for it."""
+_LAGS = {"eddy_pole", "sensor_lag"}
+"""Causes that another is named for where they lead: the current is late then, and the delay has followed it."""
+_LATEST = 0.5  # samples of a lag that its first order explains
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
@@ -164,7 +167,7 @@ def causes(
     fit: Fit, means: Mapping[str, float], rig: Rig, *, thorough: bool, delay_given: bool = False,
     freed: Freed | None = None,
 ) -> list[Cause]:  # fmt: skip
-    """Return the causes that the innovations of model one-axis or coil may have, the strongest first.
+    """Return the causes that the innovations of a model of one axis may have, the strongest first.
 
     `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed;
     `delay_given`: the delay of the voltage was not estimated; `freed`: what `free_one` says of each fixed value, where
@@ -184,7 +187,7 @@ def seen(look: Look, *, thorough: bool, delay_given: bool = False) -> list[Cause
     lines = _lines(look)
     top_hz = _top(spectra, lines) * rate_hz / course.t.size if thorough else 0.0
     groups = list(groups_of(course, top_hz, thorough=thorough))
-    if delay_given:
+    if delay_given and "voltage" in course.channels:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
     groups += [("line", _waving(lines, course.t.size))] if lines else []
@@ -199,10 +202,18 @@ def seen(look: Look, *, thorough: bool, delay_given: bool = False) -> list[Cause
 
 
 def ranked(found: Sequence[Cause]) -> list[Cause]:
-    """Return causes, the strongest first, without those of the wrong sign."""
-    found = sorted(found, key=_net)
+    """Return causes, the strongest first, without those of the wrong sign: where one leads, the current is late."""
+    found = [
+        replace(c, name="current_lag", channel="current", size=-c.size) if c.name in _LAGS and c.size < 0.0 else c
+        for c in sorted(found, key=_net)
+    ]
+    late = next((c for c in found if c.name == "current_lag"), None)
     return [  # a current that drifts acts as force and voltage together, and explains much of either
-        c for c in found if (c.name != "slow_current" or c is found[0]) and not (c.name in _OPPOSING and c.size < 0.0)
+        c
+        for c in found
+        if (c.name != "slow_current" or c is found[0])
+        and not (c.name in _OPPOSING and c.size < 0.0)
+        and (c.name != "current_lag" or c is late)
     ]
 
 
@@ -269,7 +280,8 @@ def extended(
     what is left beside the sizes.
     """
     strong = _strong(found, doubtful=doubtful)
-    if not strong or fit.problem.n_used > _LONGEST:
+    late = max((c.size * fit.problem.rate_hz for c in strong if c.name in _LAGS), default=0.0)
+    if not strong or late > _LATEST or fit.problem.n_used > _LONGEST:
         return None
     cause, alike = strong[0], to_take(found, doubtful=doubtful)[1:]
     more = None
@@ -406,12 +418,15 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> C
     problem, model = fit.problem, fit.problem.model
     columns = [model.states.index(n) if n in model.states else -1 for n in ("position", "velocity", "current")]
     x, v, i = (states[:, k] * problem.scales.state[k] if k >= 0 else np.zeros(len(states)) for k in columns)
-    theta, delay = {"k_i": 0.0, **problem.parameters(fit.vector)}, problem.delay_samples(fit.vector)
+    theta = {"k_i": 0.0, "R": 0.0, "L": 1.0, **problem.parameters(fit.vector)}
+    delay = problem.delay_samples(fit.vector)
     whole = int(np.floor(delay))
-    first = problem.skip + at.start - whole - 2
-    raw = problem.u[np.maximum(np.arange(first, first + x.size + 2), 0), 0]
-    held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from one before on
-    rest, u, last = theta["R"] * i + theta["k_i"] * v, held[1:], held[:-1]
+    first = problem.skip + at.start - whole - 3
+    raw = problem.u[np.maximum(np.arange(first, first + x.size + 3), 0), 0]
+    held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from two before on
+    rest, u, last = theta["R"] * i + theta["k_i"] * v, held[2:], held[1:-1]
+    if model.inputs == ("current",):  # at each sample, by the means before it
+        i = 1.5 * last - 0.5 * held[:-2]
     return Course(
         t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
         before=(last - rest) / theta["L"],
@@ -635,6 +650,8 @@ def causes_check(
     first = sure[0]
     alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
     same = [n for n in SAME_AS.get(first.name, ()) if n != "sensor_lag" or record is None or "position" in record]
+    if first.name == "eddy_pole" and record is not None and "voltage" not in record:
+        same = ["sensor_lag", "sensor_pole"]  # a force that lags and a position that does are the same to an input
     others = tuple(dict.fromkeys([*alike, *same]))
     refits = checks.get("estimates_agree", _SOUND)
     if not refits.passed and between_samples(record):

@@ -223,7 +223,7 @@ def agreements(
     alone: Mapping[str, float],
     freed: Freed | None = None,
 ) -> dict[str, Check]:
-    """Compare the facts of a record with an estimate from it, model one-axis or coil.
+    """Compare the facts of a record with an estimate from it.
 
     `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model; `freed`: what
     `free_one` says of fixed ones. The weight has a check of its own, `ambid.validation.physical.gravity_balance`.
@@ -233,7 +233,7 @@ def agreements(
         for n in ("k_i", "L")
     )  # fmt: skip
     checks = {name: c for name, c in facts(record, rig, belongs=force, coil=coil).items() if name != "weight"}
-    means = checks["ohm"].values
+    means = checks["ohm"].values if "ohm" in checks else {}
     if means:  # less what the flux took up from the first sample to the last
         i, rise = record["current"].values, 0.0
         for name, role in (("L", "current"), ("k_i", "position")):
@@ -242,8 +242,7 @@ def agreements(
         gain, step = (freed or {}).get("R", (0.0, np.zeros(1)))
         shown = (theta["R"] + float(step[-1]), abs(float(step[-1])) / np.sqrt(gain)) if gain > 0.0 else None
         checks["ohm"] = ohm(record, theta["R"], alone.get("R", 0.0), value, means["sd"], shown=shown)
-    checks["sampling"] = sampling(theta, sd, record.rate_hz)
-    return checks
+    return checks | ({"sampling": sampling(theta, sd, record.rate_hz)} if "L" in theta else {})
 
 
 def between_samples(record: Record) -> bool:
@@ -253,6 +252,8 @@ def between_samples(record: Record) -> bool:
     the past of current and position says.
     """
     names = [name for name in ("voltage", "current", "position") if name in record]
+    if "voltage" not in names:
+        return False
     v, i, *x = (record[name].values[:_LONGEST] - record[name].values.mean() for name in names)
     power = np.abs(np.fft.rfft(v * np.hanning(v.size))) ** 2
     if power[power.size // 2 :].sum() < _TOP * power.sum():
@@ -337,7 +338,7 @@ def informed(
     """
     theta, names, n = fit.problem.parameters(fit.vector), spread.names, len(spread.names)
     weight, covariance, moves = facts.get("gravity_balance"), spread.covariance(robust=robust), list[Array]()
-    if not facts["ohm"].passed and "R" in names:  # an offset explains it as well, and leaves the others
+    if "R" in names and not facts["ohm"].passed:  # an offset explains it as well, and leaves the others
         moves.append((facts["ohm"].size or 0.0) * np.eye(n)[names.index("R")])
     if weight is not None and not weight.passed and "k_i" in names:
         j, far = names.index("k_i"), weight.values["expected"] - weight.values["k_i_over_m"]

@@ -449,8 +449,8 @@ _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean curren
 def fact_checks(
     fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool, freed: Freed | None = None
 ) -> dict[str, Check]:
-    """Check an estimate of model one-axis or coil against what its record, and of the former gravity and the rig's
-    controller, say without a fit.
+    """Check an estimate against what its record, and of model one-axis gravity and the rig's controller, say without a
+    fit.
 
     `robust`: which standard deviations count; `freed`: as of `assumption_checks`. The balance of gravity is asked for
     by default where the current keeps its sign, as that of one magnet that carries a weight does, and its mean is that
@@ -469,7 +469,7 @@ def fact_checks(
         return checks
     loop = loop_agrees(rig, theta, bench.rate_hz)
     checks |= {} if loop is None else {"loop_agrees": loop}
-    magnet, means = rig.magnet, checks["ohm"].values
+    magnet, means = rig.magnet, checks["ohm"].values if "ohm" in checks else {}
     if magnet is None and "value" in means and abs(means["value"] / theta["R"] - 1.0) < _OWN_CURRENT:
         magnet = RigMagnet()
     if carries_weight(magnet, bench["current"].values):
@@ -571,9 +571,9 @@ def _value(p: object, value: float, sd: float) -> tuple[float, float]:
 
 def loop_agrees(rig: Rig, theta: Mapping[str, float], rate_hz: float) -> Check | None:
     """Check that the rig's controller holds what was identified (`theta` of model one-axis, SI), and not its mirror
-    image; None without a loop in the rig or the record.
+    image; None without a coil, or a loop in the rig or the record.
     """
-    if rig.loop is None or not rig.loop.closed or rig.open_loop:
+    if rig.loop is None or not rig.loop.closed or rig.open_loop or "R" not in theta:
         return None
     poles, mirrored = (
         float(np.abs(closed_loop_poles({**theta, "k_i": sign * theta["k_i"]}, rig.loop, rate_hz)).max())
