@@ -21,6 +21,7 @@ from ambid.bearing.rescue import EVALUATIONS, Rescue, rescue
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import (
+    STEPS,
     Fit,
     Workspace,
     extend,
@@ -31,10 +32,11 @@ from ambid.estimation.likelihood import (
     workspace_near,
 )
 from ambid.estimation.linear import directions, one_thread
-from ambid.estimation.predictor import PredictorProblem, assemble, stable
+from ambid.estimation.predictor import PredictorProblem, assemble, busiest, stable
 from ambid.physics.linear_model import LinearModel, Parameter
 
-_LOOK = 3  # steps of a search with which another delay is looked at
+_LOOK, _LOOKED = 3, 4096  # steps of a search with which another delay is looked at, and samples, the busiest
+_TRIED, _AGAIN = 30, 20  # steps of a search for what may not be there, and of one that begins where it would end
 _SECOND = np.array([2.0, -5.0, 4.0, -1.0]) / 12.0  # of this sample and those before: second difference over 12
 _FAR = 5.0  # standard deviations that the course between samples may move a number by
 
@@ -143,7 +145,7 @@ def _follow(
     """
     fit: Fit | None = None
     for candidate in candidates:
-        fit_of_candidate = _search(candidate, tick, with_disturbances=noise != "auto")
+        fit_of_candidate = _search(candidate, tick, with_disturbances=noise != "auto", trial=trial)
         fit = fit_of_candidate if fit is None or fit_of_candidate.criterion < fit.criterion else fit
         if fit_of_candidate.status == "converged":
             break
@@ -160,17 +162,18 @@ def _follow(
     return _with_gain(fit, tick, force=noise == "gain")
 
 
-def _search(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
+def _search(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool, trial: bool) -> Fit:
     """Search with sensor noise alone (output error) where that explains a stable plant, else with disturbances too."""
     if not with_disturbances:
-        fit = _quiet(candidate.problem, candidate.vector, tick, candidate.work)
+        fit = _quiet(candidate.problem, candidate.vector, tick, candidate.work, _TRIED)
         if fit is not None and fit.status == "converged" and _gain_promise(fit) <= 0:
             return fit
-    return search(candidate.problem, candidate.vector, tick=tick, work=candidate.work)
+    steps = _TRIED if trial else STEPS
+    return search(candidate.problem, candidate.vector, steps=steps, tick=tick, work=candidate.work)
 
 
 def _quiet(
-    problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None, work: Workspace | None
+    problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None, work: Workspace | None, steps: int
 ) -> Fit | None:
     """Search with sensor noise alone; None for an unstable plant, which needs its states corrected."""
     at = assemble(problem, vector, with_derivatives=False)
@@ -180,14 +183,14 @@ def _quiet(
     start = np.zeros(quiet.size)
     for group in ("physical", "fraction", "offset", "initial"):
         start[quiet.slices[group]] = vector[problem.slices[group]]
-    return search(quiet, start, tick=tick, work=work)
+    return search(quiet, start, steps=steps, tick=tick, work=work)
 
 
 def _without_disturbances(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     """Drop the disturbances again where a wrong delay was all that they stood for."""
     if fit.problem.noise != "levels":
         return fit
-    quiet = _quiet(fit.problem, fit.vector, tick, fit.work)
+    quiet = _quiet(fit.problem, fit.vector, tick, fit.work, _AGAIN)
     price = (fit.problem.size - (quiet.problem.size if quiet else 0)) * np.log(fit.problem.n_used)
     return quiet if quiet is not None and quiet.criterion - fit.criterion < price else fit
 
@@ -294,17 +297,24 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
 
 def _better_delay(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
     """The fit at another whole delay, if one is better: under feedback the likelihood has minima far apart."""
-    others = [d for d in range(max(MAX_DELAY, fit.problem.delay + 1) + 1) if d != fit.problem.delay]
-    trials = [_at_delay(fit, d, tick) for d in others]
-    nearest = min(trials, key=_per_sample)
-    other = search(nearest.problem, nearest.vector, tick=tick, work=nearest.work)
+    own = fit.problem.delay
+    trials = {d: _at_delay(fit, d, tick) for d in range(max(MAX_DELAY, own + 1) + 1)}
+    like = trials.pop(own)
+    nearest = min(trials.values(), key=_per_sample)
+    settled = search(nearest.problem, nearest.vector, tick=tick, work=nearest.work)
+    if not _per_sample(settled) < _per_sample(like):
+        return None
+    problem = replace(fit.problem, delay=nearest.problem.delay, skip=nearest.problem.skip)
+    other = search(problem, settled.vector, tick=tick)
     return other if _per_sample(other) < _per_sample(fit) else None
 
 
 def _at_delay(fit: Fit, delay: int, tick: Callable[[], None] | None) -> Fit:
-    """A short search at another whole delay, from the numbers of a fit."""
+    """A short search at another whole delay, from the numbers of a fit, over a part of the record."""
     problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
-    return search(problem, carry(fit, problem), steps=_LOOK, tick=tick, work=workspace_near(fit, problem))
+    at = busiest(problem.u, _LOOKED)
+    part = replace(problem, u=problem.u[at], y=problem.y[at])
+    return search(part, carry(fit, part), steps=_LOOK, tick=tick, work=workspace_near(fit, part))
 
 
 def _per_sample(fit: Fit) -> float:
@@ -319,6 +329,8 @@ def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit
     if not force and (price <= 0 or _gain_promise(fit) <= 0):
         return fit
     freed = search(free, carry(fit, free), tick=tick, work=workspace_near(fit, free))
+    if fit.problem.noise == "levels":
+        freed = replace(freed, leveled=fit)
     return freed if force or fit.criterion - freed.criterion > price else fit
 
 

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.likelihood import Fit, Workspace, evaluate, search
+from ambid.estimation.likelihood import Fit, Workspace, evaluate, extend, search
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import PredictorProblem, Scales
 from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
@@ -20,8 +20,7 @@ _LEVEL = -2.0  # centre of the weak prior on the log level
 _OVER = (-4.0, -2.0, 0.0, 2.0, 4.0)  # logarithm of its level over that of the white part, at the start
 _SHAPE = ("colour.omega", "colour.damping")  # names of their logarithms, over those at the start
 _RISE = 4.0  # of the criterion, to the end of what a record allows
-_STEP, _FARTHEST = 0.25, 5.0  # logarithms of the first move of a corner, and of the last
-_SOON = 15  # steps of a search beside
+_FARTHEST, _SOON = 5.0, 3  # logarithm of the last move of a corner, and steps of a search there
 _PLACES = 9  # corners of low passes, and widths of resonances, that are looked at
 _POWERS = np.geomspace(0.1, 1e6, 12)  # of coloured noise over white, where it stands highest
 _REACH = 2.0  # standard deviation of the weak prior on these
@@ -118,14 +117,16 @@ class Coloured:
 
     def _beside(self, space: StateSpace) -> StateSpace:
         """Return matrices, or slopes of them, with room for colours and the way of those that disturb."""
-        (n, _), more = space.E.shape, sum(c.order for c in self.colours)
+        (n, n_d), more = space.E.shape, sum(c.order for c in self.colours)
+        own, n_y = n, space.C.shape[0]
         wide = StateSpace(
-            A=np.pad(space.A, (0, more)), B=np.pad(space.B, ((0, more), (0, 0))),
-            E=np.pad(space.E, ((0, more), (0, len(self.colours)))), C=np.pad(space.C, ((0, 0), (0, more))),
+            A=np.zeros((n + more, n + more)), B=np.zeros((n + more, space.B.shape[1])),
+            E=np.zeros((n + more, n_d + len(self.colours))), C=np.zeros((n_y, n + more)),
         )  # fmt: skip
+        wide.A[:n, :n], wide.B[:n], wide.E[:n, :n_d], wide.C[:, :n] = space.A, space.B, space.E, space.C
         for colour in self.colours:
             if colour.source in self.plain.disturbances:
-                wide.A[: len(self.plain.states), n] = space.E[:, self.plain.disturbances.index(colour.source)]
+                wide.A[:own, n] = space.E[:, self.plain.disturbances.index(colour.source)]
             n += colour.order
         return wide
 
@@ -175,13 +176,18 @@ def scaled_for(scales: Scales, plain: LinearModel, colours: Sequence[Colour]) ->
     return replace(scales, state=state, disturbance=np.append(scales.disturbance, own))
 
 
+def plain_of(model: LinearModel) -> LinearModel:
+    """Return a model without coloured parts."""
+    return model.plain if isinstance(model, Coloured) else model
+
+
 def with_colours(
     problem: PredictorProblem, vector: Array, colours: Sequence[Colour], over: float = 0.0
 ) -> tuple[PredictorProblem, Array]:
     """Return a problem with further coloured parts, and its vector with their log levels `over` those of the white
     parts of their sources.
     """
-    plain = problem.model.plain if isinstance(problem.model, Coloured) else problem.model
+    plain = plain_of(problem.model)
     end, white = len(problem.model.disturbances), len(plain.disturbances)
     at = [(*plain.disturbances, *plain.outputs).index(c.source) for c in colours]
     noise = vector[problem.slices["noise"]]
@@ -200,19 +206,19 @@ def coloured(fit: Fit, choices: Sequence[Sequence[Colour]], tick: Callable[[], N
     """Fit again with the likeliest of several choices of coloured parts of one frequency and damping, at the likeliest;
     None where that does not settle, or gains less than its numbers cost (BIC).
     """
-    before = fit if fit.problem.noise == "levels" else _with_levels(fit, tick)
+    before, had = fit if fit.problem.noise == "levels" else _with_levels(fit, tick), len(colours_of(fit.problem))
     least, begun, work = before.criterion, None, None
     for colours, over in product(choices, _OVER):
         problem, vector = with_colours(before.problem, before.vector, colours, over)
         work = Workspace(problem) if work is None else work.of(problem)
         value = evaluate(problem, vector, work)[0]
         least, begun = (value, (problem, vector)) if value < least else (least, begun)
-    had = len(colours_of(fit.problem))
     more = None if begun is None else _shaped(*begun, range(had, len(colours_of(begun[0]))), tick)
     if more is None or more.status != "converged":
         return None
     numbers = more.problem.slices["offset"].start - fit.problem.slices["offset"].start
     price = (numbers + colours_of(more.problem)[-1].order) * np.log(fit.problem.y.size)
+    more = replace(more, leveled=fit.leveled if had else before)
     return more if fit.criterion - more.criterion > price else None
 
 
@@ -224,6 +230,18 @@ def resettled(fit: Fit, which: int) -> Fit:
 
 def _shaped(problem: PredictorProblem, vector: Array, which: Sequence[int], tick: Callable[[], None] | None) -> Fit:
     """Search with frequency and damping of some colours free, which have one, then with them where they are."""
+    n, (free, began) = problem.n_physical, _freed(problem, vector, which)
+    found = search(free, began, tick=tick)
+    assert isinstance(free.model, _Shaped)
+    there = replace(problem, model=free.model.at(free.parameters(found.vector))[0])
+    rest = np.delete(found.vector, slice(n, free.n_physical))
+    return search(there, rest, tick=tick, work=found.work)
+
+
+def _freed(problem: PredictorProblem, vector: Array, which: Sequence[int]) -> tuple[PredictorProblem, Array]:
+    """Return a problem with frequency and damping of some colours, which have one, as further numbers, and its vector
+    there.
+    """
     n, begun, priors = problem.n_physical, problem.model, problem.joint_priors
     assert isinstance(begun, Coloured)
     names = _SHAPE[: begun.colours[which[0]].order]
@@ -234,23 +252,24 @@ def _shaped(problem: PredictorProblem, vector: Array, which: Sequence[int], tick
         slopes, left = priors(values[:n])
         return np.pad(slopes, ((0, 0), (0, k))), left
 
-    model = _Shaped(plain=begun.plain, colours=begun.colours, which=tuple(which))
     free = replace(
-        problem, model=model, estimated=(*problem.estimated, *names), joint_priors=priors and joint,
+        problem, model=_Shaped(plain=begun.plain, colours=begun.colours, which=tuple(which)),
+        estimated=(*problem.estimated, *names), joint_priors=priors and joint,
         magnitude=np.append(problem.magnitude, np.ones(k)), prior_mean=np.append(problem.prior_mean, np.zeros(k)),
         prior_sd=np.append(problem.prior_sd, np.full(k, _REACH)),
     )  # fmt: skip
-    found = search(free, np.insert(vector, n, np.zeros(k)), tick=tick)
-    there = replace(problem, model=model.at(free.parameters(found.vector))[0])
-    return search(there, np.delete(found.vector, slice(n, n + k)), tick=tick, work=found.work)
+    return free, np.insert(vector, n, np.zeros(k))
 
 
 def _with_levels(fit: Fit, tick: Callable[[], None] | None) -> Fit:
-    """Fit again with the noise as levels, instead of a gain that holds colours of its own."""
-    problem = replace(fit.problem, noise="levels")
+    """Fit again with the noise as levels, instead of a gain that holds colours of its own, unless that is there."""
+    problem, had = replace(fit.problem, noise="levels"), fit.leveled
+    if had is not None and had.problem.y is problem.y and had.problem.extra is problem.extra:
+        return had
     own, vector = fit.problem.slices, np.empty(problem.size)
+    levels = problem.noise_center if had is None else had.vector[had.problem.slices["noise"]]
     for group, there in problem.slices.items():
-        vector[there] = problem.noise_center if group == "noise" else fit.vector[own[group]]
+        vector[there] = levels if group == "noise" else fit.vector[own[group]]
     return search(problem, vector, tick=tick)
 
 
@@ -266,20 +285,27 @@ def left_open(fit: Fit) -> Array:
     for j, colour in enumerate(colours_of(problem)):
         if colour.damping is not None or colour.source in problem.model.outputs:
             continue
-        steps, work = [np.zeros(n)], fit.work
-        for way in (-1.0, 1.0):
-            near, by = fit.vector, _STEP
-            while by < _FARTHEST and colour.omega * np.exp(way * by) < np.pi * problem.rate_hz:
+        rows = extend(fit, *_freed(problem, fit.vector, [j]))
+        if rows is None:
+            continue
+        along = directions(rows[0]).inverse()[:, n]  # where all numbers go with the corner
+        sd, along = float(np.sqrt(along[n])), np.delete(along, n) / along[n]
+        steps, work = [sd * along[:n]], fit.work
+        for way, most in ((-1.0, _FARTHEST), (1.0, float(np.log(np.pi * problem.rate_hz / colour.omega)))):
+            near, slope, at, by = fit.vector, way * along, 0.0, min(2.0 * sd, most, _FARTHEST)
+            while by > at:
                 there = _at(problem, j, replace(colour, omega=colour.omega * np.exp(way * by)))
-                again = search(there, near, steps=_SOON, work=None if work is None else work.of(there))
+                begun, work = near + (by - at) * slope, None if work is None else work.of(there)
+                again = search(there, begun, steps=_SOON, work=work)
+                again = search(there, near, steps=_SOON, work=work) if again.status == "failed" else again
                 rise = again.criterion - fit.criterion
                 if not rise < np.inf:
                     break
-                near = again.vector
-                steps.append((near[:n] - fit.vector[:n]) / np.sqrt(max(rise, 1.0)))
+                steps.append((again.vector[:n] - fit.vector[:n]) / np.sqrt(max(rise, 1.0)))
                 if rise > _RISE:
                     break
-                by *= 2.0
+                slope, near, at = (again.vector - near) / (by - at), again.vector, by
+                by = min(2.0 * by, most, _FARTHEST)
         far = np.array(steps)[np.argmax(np.sum((np.array(steps) @ _whitener(fit)) ** 2, axis=1))]
         total += np.outer(far, far)
     return total
@@ -303,10 +329,10 @@ def without_colours(fit: Fit) -> Fit:
     """Return a fit of white noise alone, at the numbers of a fit with coloured parts: what a reader of the plant's own
     order can use.
     """
-    problem, n_c = fit.problem, len(colours_of(fit.problem))
-    if not isinstance(problem.model, Coloured):
+    problem, n_c, n = fit.problem, len(colours_of(fit.problem)), fit.problem.n_physical
+    if not n_c:
         return fit
-    plain, n = problem.model.plain, problem.n_physical
+    plain = plain_of(problem.model)
     states, white = len(plain.states), len(plain.disturbances)
     scales = replace(
         problem.scales, state=problem.scales.state[:states], disturbance=problem.scales.disturbance[:white]
@@ -319,6 +345,8 @@ def without_colours(fit: Fit) -> Fit:
     )  # fmt: skip
     level = problem.slices["noise"].start + white
     vector = np.delete(fit.vector, slice(level, level + n_c))[n : n + alone.size]
+    if fit.leveled is not None:
+        vector[alone.slices["noise"]] = fit.leveled.vector[fit.leveled.problem.slices["noise"]]
     return search(alone, vector)
 
 
@@ -351,5 +379,5 @@ def _peaks(power: Array, f: Array) -> Iterator[tuple[float, float]]:
 
 def _explained(power: Array, shape: Array) -> float:
     """Return the fall of the criterion by noise of a shape beside white noise, at its likeliest level."""
-    more = _POWERS[:, None] * shape
-    return 2.0 * float(np.max(np.sum(power * more / (1.0 + more) - np.log1p(more), axis=1)))
+    whole = 1.0 + _POWERS[:, None] * shape
+    return 2.0 * float(np.max(np.sum(power) - (1.0 / whole) @ power - np.sum(np.log(whole), axis=1)))

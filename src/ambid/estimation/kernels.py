@@ -91,3 +91,13 @@ def sensitivity_scan(F: Array, w: Array, y: Array, s: Array, rows: Array, last: 
         for i in range(n):
             for q in range(width):
                 s[i, q] = new[i, q]
+
+
+@compiled
+def play(x: Array, width: float) -> Array:
+    """Return what follows x (n,) through a slack of a width."""
+    out, at = np.empty_like(x), x[0]
+    for k in range(x.size):
+        at = min(max(at, x[k] - 0.5 * width), x[k] + 0.5 * width)
+        out[k] = at
+    return out

@@ -331,7 +331,7 @@ def null_space(a: Array) -> Array:
 
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
-_STEPS = 200
+STEPS = 200  # of a search, at most
 _SETTLED = 0.01  # Newton step of every physical parameter, in standard deviations, below which a search has converged
 _FLAT = 0.001  # fall of the criterion in one step below which a search has converged; a needless number earns one
 PAST = 10  # samples of innovations that a regression looks at, which tells whether a fit has failed
@@ -354,6 +354,7 @@ class Fit(PhysicalFit):
     start_s: float = 0.0  # time that finding start values took before this search, s
     work: Workspace | None = None  # scaled data, and the triangle near the optimum, for those who go on from here
     freed: Array | None = None  # Jacobian with the delay freed as well, where that was asked and is not needed
+    leveled: Fit | None = None  # the same with the noise as levels, of which the gain was freed
     beside: Array | None = None  # (n_physical, n_physical), what sizes of causes add to the covariance of the numbers
 
 
@@ -490,7 +491,7 @@ def search(
     problem: PredictorProblem,
     start: Array,
     *,
-    steps: int = _STEPS,
+    steps: int = STEPS,
     tick: Callable[[], None] | None = None,
     work: Workspace | None = None,
 ) -> Fit:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, disowned, plain_json, warnings_of
 from ambid.estimation.linear import one_thread
@@ -43,9 +44,10 @@ from ambid.settings.calls import of_job
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.bearing.multistart import Signals
+    from ambid.bearing.uncertainty import Uncertainty
     from ambid.control.experiment import Experiment
     from ambid.estimation.estimate import Check
-    from ambid.estimation.likelihood import Fit
+    from ambid.estimation.likelihood import Fit, Freed
     from ambid.rotor.estimate import RotorEstimate
     from ambid.validation.causes import Cause
 
@@ -259,79 +261,90 @@ def _with_facts(refusal: str, bench: Record, rig: Rig) -> str:
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
-    """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if the
+    """Judge a fit; while a check names a cause that the model can take in, test one with it, and keep the last if the
     model fits now, fewer checks fail, and none that did not before, but that a fixed value shows as wrong. Else the
     first estimate stays, with its causes; also where a fixed value or a prior may be what is wrong, unless the cause
     changes in time.
     """
-    from ambid.validation.causes import extended, told, worse
+    from ambid.validation.causes import OF_THE_MODEL, extended, told, worse
     from ambid.validation.residuals import P_LEAST
 
-    estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
-    first, plain = estimate, fit.problem
+    began = last = _tested(fit, rig, bench, delay_how)
     taken: tuple[Cause, ...] = ()
+    plain, means = fit.problem, _means_of(bench, fit)
     for _ in range(_CAUSES):
-        named, fixed = estimate.checks.get("causes"), estimate.checks["fixed_agree"].p
-        if named is None or named.passed or not estimate.checks["long_enough"].passed:  # a walk is all that shows then
+        named, fixed = last.checks.get("causes"), last.checks["fixed_agree"].p
+        if named is None or named.passed or not last.checks["long_enough"].passed:  # a walk is all that shows then
             break
-        prior = chi_squared_tail(1, estimate.checks["priors_agree"].values["largest_sd"] ** 2)
+        prior = chi_squared_tail(1, last.checks["priors_agree"].values["largest_sd"] ** 2)
         doubtful = min(prior, 1.0 if fixed is None else fixed) < P_LEAST
-        more = extended(fit, first.operating_point, found, plain, taken, doubtful=doubtful)
+        more = extended(fit, means, last.named, plain, taken, doubtful=doubtful)
         if more is None:
             break
         fit, plain, taken = more
-        estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
-        estimate = replace(estimate, extended=told(fit, taken))
-    if worse(first.checks, estimate.checks) or not taken:
-        return first if worse(first.checks, estimate.checks) else estimate
-    moved = {name: math.hypot(sd, estimate[name].value - first[name].value) for name, sd in estimate.bias_sd.items()}
-    return replace(estimate, bias_sd=moved)
+        last = _tested(fit, rig, bench, delay_how)
+    first = _concluded(began, rig, bench, delay_how)
+    if last is began or any(not last.checks[name].passed for name in OF_THE_MODEL & last.checks.keys()):
+        return first
+    grown = replace(_concluded(last, rig, bench, delay_how), extended=told(fit, taken))
+    if worse(first.checks, grown.checks) or not taken:
+        return first if worse(first.checks, grown.checks) else grown
+    moved = {name: math.hypot(sd, grown[name].value - first[name].value) for name, sd in grown.bias_sd.items()}
+    return replace(grown, bias_sd=moved)
 
 
-def _judged(
-    fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]
-) -> tuple[Estimate, list[Cause]]:
-    """Check a fit that has not failed on its own record `bench`, by role; return the estimate, without timings, and the
-    causes that the innovations may have, the strongest first.
-    """
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Tested:
+    """A fit that has not failed, with the tests of its innovations and of what was taken for known."""
+
+    fit: Fit
+    e: Array  # (n_used, n_outputs), innovations, scaled
+    spread: Uncertainty
+    checks: dict[str, Check]
+    robust: bool  # whether one of the innovations' tests failed
+    freed: Freed
+    named: list[Cause]  # that the innovations may have, the strongest first
+
+
+def _tested(fit: Fit, rig: Rig, bench: Record, delay_how: Literal["estimated", "given"]) -> _Tested:
+    """Test a fit on its own record `bench`, by role."""
     from ambid.bearing.columns import check_lag
     from ambid.bearing.linear import course_left_open
-    from ambid.bearing.uncertainty import estimate_of, uncertainty
-    from ambid.estimation.calibration import calibrated, linear_moves, lines_of
-    from ambid.estimation.likelihood import free_one, innovations, simulation_error
+    from ambid.bearing.uncertainty import uncertainty
+    from ambid.estimation.colours import colours_of, left_open
+    from ambid.estimation.likelihood import free_one, innovations
     from ambid.validation import physical
     from ambid.validation.causes import causes, causes_check, named_bias
-    from ambid.validation.facts import informed
-    from ambid.validation.residuals import fit_of
 
     between: dict[str, Check] = {}
     if rig.measured_input:
         fit, between["current_between_samples"] = course_left_open(fit)
-    problem = fit.problem
-    means = {role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)}
+    problem, means = fit.problem, _means_of(bench, fit)
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
     if e is None:
         raise EstimationError(
             "the search found no stable predictor for this record. Check columns, signs and fixed values"
         )
-    products = physical.innovation_products(fit, e)
-    spread, moved = uncertainty(fit, products.scores), physical.agreement(fit)
+    products, moved = physical.innovation_products(fit, e), physical.agreement(fit)
+    spread = uncertainty(fit, products.scores)
     checks = physical.innovation_checks(fit, products, spread, moved)
+    if colours_of(problem) and all(c.passed for name, c in checks.items() if name != "uncertainty_consistent"):
+        fit = replace(fit, beside=left_open(fit) + (0.0 if fit.beside is None else fit.beside))  # this one may stay
+        spread = uncertainty(fit, products.scores)
+        checks = physical.innovation_checks(fit, products, spread, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     if robust:
-        spread = replace(spread, disagreement=np.vstack([moved.disagreement(), physical.by_bands(fit)]))
+        spread = replace(spread, disagreement=moved.disagreement()[None])
     freed = {name: free_one(fit, name) for name in problem.known}
     checks |= physical.assumption_checks(fit, spread, freed, delay_how)
-    signals = signals_of(bench, problem.model)
     axis = problem.model.name == "one-axis"
-    in_time = {"in_time": check_lag(signals)} if axis else {}
+    in_time = {"in_time": check_lag(signals_of(bench, problem.model))} if axis else {}
     curved, bent, own = None, False, np.sqrt(np.diag(spread.information))
     if axis and (rig.magnet is not None or rig.limits is not None):  # else no law of the magnet is known
         from ambid.control.curvature import magnet_checks
         from ambid.control.experiment import MOST
 
-        by_refits = replace(spread, disagreement=spread.disagreement[:1])  # bands bend too
-        sd = by_refits.standard_deviations(robust=robust)
+        sd = spread.standard_deviations(robust=robust)  # of refits, before bands, which bend too
         checks |= magnet_checks(fit, e, rig, means, sd)
         curved = checks.get("curvature")
     if curved is not None:
@@ -350,27 +363,49 @@ def _judged(
         if checks["causes"].passed:
             break
     spread = replace(spread, bias=named_bias(named, spread.bias))
-    alone = spread.information
-    facts = physical.fact_checks(fit, rig, bench, spread, robust=robust, freed=freed)
+    checks |= between
+    return _Tested(fit=fit, e=e, spread=spread, checks=checks, robust=robust, freed=freed, named=named)
+
+
+def _concluded(tested: _Tested, rig: Rig, bench: Record, delay_how: Literal["estimated", "given"]) -> Estimate:
+    """Compare a fit that was tested with what is known without it, and return the estimate, without timings."""
+    from ambid.bearing.uncertainty import estimate_of
+    from ambid.estimation.calibration import calibrated, linear_moves, lines_of
+    from ambid.estimation.likelihood import simulation_error
+    from ambid.validation import physical
+    from ambid.validation.facts import informed
+    from ambid.validation.residuals import fit_of
+
+    fit, spread, checks, robust = tested.fit, tested.spread, tested.checks, tested.robust
+    if robust:
+        spread = replace(spread, disagreement=np.vstack([spread.disagreement, physical.by_bands(fit)]))
+    alone, model = spread.information, fit.problem.model
+    facts = physical.fact_checks(fit, rig, bench, spread, robust=robust, freed=tested.freed)
     fit, spread, used = informed(fit, rig, bench, {**checks, **facts}, spread, robust=robust)
     if used is not None:
         text = f"{facts['gravity_balance'].detail}. The estimate uses it"
         facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}
-    checks |= physical.physical_checks(fit, spread, bench, robust=robust)
-    checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
-    checks |= {**facts, **between}
-    y, error = problem.y[problem.skip :], simulation_error(fit)
+    checks = checks | physical.physical_checks(fit, spread, bench, robust=robust)
+    checks["units"] = _units(fit, rig, signals_of(bench, model), doubt=not checks["fixed_agree"].passed)
+    checks |= facts
+    problem, error = tested.fit.problem, simulation_error(fit)
+    y, e = problem.y[problem.skip :], tested.e * problem.scales.output
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(
         fit, spread, rig.parameters, robust=robust, delay_how=delay_how,
-        means=means, one_step=fit_of(e * problem.scales.output, y),
-        simulation=None if error is None else fit_of(error, y),
+        means=_means_of(bench, fit), one_step=fit_of(e, y), simulation=None if error is None else fit_of(error, y),
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
-    known = rig, problem.model, theta, spread.names
+    known = rig, model, theta, spread.names
     moves = partial(linear_moves, *known, alone, [lines_of(fit)], weight=used)
-    return calibrated(estimate, *known, moves), named
+    return calibrated(estimate, *known, moves)
+
+
+def _means_of(bench: Record, fit: Fit) -> dict[str, float]:
+    """Return the operating point of a fit's record, by role, SI."""
+    model = fit.problem.model
+    return {role: float(bench[role].values.mean()) for role in (*model.inputs, *model.outputs)}
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

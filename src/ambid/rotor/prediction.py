@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.colours import Colour, Coloured, coloured, colours_of, with_colours
+from ambid.estimation.colours import Colour, Coloured, coloured, colours_of, plain_of, with_colours
 from ambid.estimation.likelihood import (
     Fit,
     innovations,
@@ -383,8 +383,7 @@ def _late(u: Array, delays: NDArray[np.intp]) -> Array:
 
 def searched_of(fit: Fit) -> Searched:
     """Return the model of a fit."""
-    model = fit.problem.model
-    searched = model.plain if isinstance(model, Coloured) else model
+    searched = plain_of(fit.problem.model)
     assert isinstance(searched, Searched)
     return searched
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.kernels import play
 from ambid.estimation.likelihood import run
 
 WAVES = 8  # half waves over the record of a force or voltage that walks
@@ -71,7 +72,7 @@ def _groups_of(s: Course, mode: float, *, thorough: bool) -> Groups:
     if not thorough:
         return
     yield "limiter", tuple((("voltage", -end),) for signal in (s.u, s.u - s.u_before) for end in _ends(signal))
-    slack = _play(s.i, _PLAY * float(np.ptp(s.i))) - s.i
+    slack = play(s.i, _PLAY * float(np.ptp(s.i))) - s.i
     flux = -s.theta["L"] * _rate(slack, s.rate_hz)
     yield "hysteresis", ((("force", s.theta["k_i"] * _between(slack)),), (("voltage", flux),))
     for damping in _DAMPING:
@@ -107,15 +108,6 @@ def _curvature(s: Course, degree: int) -> Iterator[Column]:
 def _rate(signal: Array, rate_hz: float) -> Array:
     """The mean rate from each sample to the next."""
     return np.append(np.diff(signal), 0.0) * rate_hz
-
-
-def _play(x: Array, width: float) -> Array:
-    """Return what follows x through a slack of a width."""
-    out, at = np.empty_like(x), float(x[0])
-    for k, value in enumerate(x.tolist()):
-        at = min(max(at, value - 0.5 * width), value + 0.5 * width)
-        out[k] = at
-    return out
 
 
 def _oscillation(s: Course, f: float, damping: float) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array, Complex
 from ambid.bearing.uncertainty import farthest
 from ambid.estimation.calibration import explaining, lines_of
-from ambid.estimation.colours import Colour, coloured, colours_of, left_open, likely_colours, resettled
+from ambid.estimation.colours import Colour, coloured, colours_of, likely_colours, resettled
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import (
@@ -69,7 +69,7 @@ _KNOWN = {"fixed_value", "sensor_gain", "rate"}
 """Causes in what the rig says."""
 _OPPOSING = {"dead_time", "friction", "amplifier_lag", "current_sensor_pole"}
 """Causes that physics gives a sign."""
-_OF_THE_MODEL = {
+OF_THE_MODEL = {
     "causes", "residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree",
 }  # fmt: skip
 """Checks that an extension has to pass: those that asked for it."""
@@ -78,8 +78,7 @@ _LAGS = {"eddy_pole", "sensor_lag"}
 _LATEST = 0.5  # samples of a lag that its first order explains
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
-_STEPS = 40  # of a search that begins at a fit
-_TURNS = 8  # in which sizes and parameters are found in turn
+_STEPS, _TURNS = 8, 12  # of a search that begins at a fit, and turns in which sizes and parameters are found
 _NEAR = 1.5  # ratio of frequencies within which colours are of one shape
 SETTLED = 0.1  # gain below which they are
 _SOUND = Check(passed=True, detail="")  # of what was not looked for
@@ -284,7 +283,7 @@ def extended(
     if not strong or late > _LATEST or fit.problem.n_used > _LONGEST:
         return None
     cause, alike = strong[0], to_take(found, doubtful=doubtful)[1:]
-    more = None
+    more, had = None, colours_of(fit.problem)
     if cause.name not in _NOISE:
         n, size = fit.problem.n_physical, fit.problem.magnitude
         sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
@@ -293,14 +292,13 @@ def extended(
         more = _with_causes(fit, means, plain, taken, (cause, *alike))
         more = _with_causes(fit, means, plain, taken, (cause,)) if more is None and alike else more
     if more is not None:
-        return _resettled(more[0], means, plain, more[1])
-    had = colours_of(fit.problem)
+        return _resettled(more[0], means, plain, more[1], len(had))
     noises = [[c.colour] for c in found if c.colour and (c in strong or c.channel == cause.channel)]
     noises = [c for c in noises if not any(_same(c[0], h) for h in had)]
     louder = coloured(fit, noises) if noises else None
     if louder is None:
         return None
-    return _resettled(louder, means, plain, taken)
+    return _resettled(louder, means, plain, taken, len(had))
 
 
 def worse(first: Mapping[str, Check], after: Mapping[str, Check]) -> bool:
@@ -308,7 +306,7 @@ def worse(first: Mapping[str, Check], after: Mapping[str, Check]) -> bool:
     not, but that a fixed value shows as wrong.
     """
     had, has = ({name for name, c in checks.items() if not c.passed} for checks in (first, after))
-    return bool(has & _OF_THE_MODEL or has - had - {"fixed_agree"} or len(has) >= len(had))
+    return bool(has & OF_THE_MODEL or has - had - {"fixed_agree"} or len(has) >= len(had))
 
 
 def _strong(found: Sequence[Cause], *, doubtful: bool = False) -> list[Cause]:
@@ -335,21 +333,19 @@ def _same(a: Colour, b: Colour) -> bool:
 
 
 def _resettled(
-    fit: Fit, means: Mapping[str, float], plain: PredictorProblem, taken: Sequence[Cause]
+    fit: Fit, means: Mapping[str, float], plain: PredictorProblem, taken: Sequence[Cause], had: int
 ) -> tuple[Fit, PredictorProblem, tuple[Cause, ...]] | None:
-    """Return a fit, with its colours where they are likeliest beside the causes that it holds, and what is left open
-    by both.
-    """
-    for k in range(len(colours_of(fit.problem))):
+    """Return a fit with the colours that it `had` before where they are likeliest beside what it holds now."""
+    leveled = fit.leveled
+    for k in range(had):
         fit = resettled(fit, k)
     if fit.problem.model is not plain.model:
         plain = replace(fit.problem, y=plain.y, extra=plain.extra)
-        again = _with_causes(fit, means, plain, taken, ()) if taken else (replace(fit, beside=None), ())
+        again = _with_causes(fit, means, plain, taken, ()) if taken else (fit, ())
         if again is None:
             return None
         fit, taken = again
-    open_ = left_open(fit)
-    return replace(fit, beside=open_ if fit.beside is None else fit.beside + open_), plain, tuple(taken)
+    return replace(fit, leveled=leveled), plain, tuple(taken)
 
 
 def _with_causes(
@@ -358,6 +354,7 @@ def _with_causes(
     """Fit again with causes beside those `taken`; None where the search does not settle."""
     parts = [*taken, *(replace(c, sizes=np.zeros(c.sizes.size)) for c in new)]
     step = [new[0].sizes if new and k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
+    leveled = fit.leveled
     for _ in range(_TURNS):
         parts = [replace(c, sizes=c.sizes + more) for c, more in zip(parts, step, strict=True)]
         problem = _corrected(plain, [z for c in parts for z in c.columns], np.concatenate([c.sizes for c in parts]))
@@ -371,7 +368,7 @@ def _with_causes(
         step = np.split(left.sizes, np.cumsum([c.sizes.size for c in parts])[:-1])
         if left.gain < SETTLED and fit.status == "converged":
             sums = _sums(look, _through(look, columns))
-            return replace(fit, beside=beside(sums, fit.problem.n_physical)), tuple(parts)
+            return replace(fit, beside=beside(sums, fit.problem.n_physical), leveled=leveled), tuple(parts)
     return None
 
 
