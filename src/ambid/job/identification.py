@@ -315,6 +315,7 @@ def _tested(fit: Fit, rig: Rig, bench: Record, delay_how: Literal["estimated", "
     from ambid.estimation.likelihood import free_one, innovations
     from ambid.validation import physical
     from ambid.validation.causes import causes, causes_check, named_bias
+    from ambid.validation.residuals import P_LEAST
 
     between: dict[str, Check] = {}
     if rig.measured_input:
@@ -326,12 +327,10 @@ def _tested(fit: Fit, rig: Rig, bench: Record, delay_how: Literal["estimated", "
             "the search found no stable predictor for this record. Check columns, signs and fixed values"
         )
     products, moved = physical.innovation_products(fit, e), physical.agreement(fit)
+    if colours_of(problem) and moved.passed and all(t.p >= P_LEAST for t in physical.innovation_tests(fit, products)):
+        fit = replace(fit, beside=left_open(fit) + (0.0 if fit.beside is None else fit.beside))  # this one may stay
     spread = uncertainty(fit, products.scores)
     checks = physical.innovation_checks(fit, products, spread, moved)
-    if colours_of(problem) and all(c.passed for name, c in checks.items() if name != "uncertainty_consistent"):
-        fit = replace(fit, beside=left_open(fit) + (0.0 if fit.beside is None else fit.beside))  # this one may stay
-        spread = uncertainty(fit, products.scores)
-        checks = physical.innovation_checks(fit, products, spread, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     if robust:
         spread = replace(spread, disagreement=moved.disagreement()[None])
