@@ -32,7 +32,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import SensorError
 from ambid.record import Record
 from ambid.rig.rotor import RigModes
-from ambid.rotor.estimator import Ending, Starter, unknowns_at
+from ambid.rotor.estimator import Ending, Work, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point
 from ambid.rotor.scores import Cause, Score, beyond_ends, causes_of, scored
 from ambid.rotor.spectra import PeriodSpectra, windowed_spectra
@@ -226,9 +226,9 @@ def predict_rotor(
     """
     tick("start", 0.0)
     spectra = windowed_spectra(record, model, speed)
-    experiments = [Experiment(spectra=spectra, speed=speed)]
-    starter = Starter(model=model, parameters=parameters, delays=delays, modes=modes, tick=tick)
-    found, at = starter.begin(experiments)
+    experiment = Experiment(spectra=spectra, speed=speed)
+    work = Work(model=model, parameters=parameters, delays=delays, modes=modes, tick=tick)
+    found, at = work.rough_start([experiment])
     near = np.array([np.round(x) if d is None else d for x, d in zip(at.delays, delays, strict=True)])
     skip = int(near.max()) + _REST
 
@@ -245,7 +245,7 @@ def predict_rotor(
         return problem, vector
 
     fit = _search(*problem_at(found.at_speed(speed), replace(at, delays=near)), tick)
-    while (more := starter.one_more(experiments, _rotor_of(fit), _point_of(fit))) is not None:
+    while (more := work.one_more(experiment, _rotor_of(fit), _point_of(fit))) is not None:
         price = float(np.log(fit.problem.y.size)) * (3 + len(model.places))
         trial = search(*problem_at(more[0].at_speed(speed), replace(more[1], delays=near), last=fit))
         if trial.status == "failed" or not fit.criterion - trial.criterion > price:
