@@ -17,7 +17,7 @@ from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.rotor_model import RotorModel
-from ambid.physics.sensor_errors import SensorError, electrical_errors, logged_error, position_errors
+from ambid.physics.sensor_errors import Kind, SensorError, electrical_errors, logged_error, position_errors
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, sampled
 from ambid.rotor.response import Sampled
 from ambid.rotor.spectra import PeriodSpectra
@@ -245,7 +245,6 @@ def _columns(
         left = e.spectra.mean_y - (H @ mean[:, :, None])[:, :, 0]
         mean = mean - (w.back @ left[:, :, None])[:, :, 0]
     y, omega, outputs, inputs = of.states(mean) @ of.space.C.T, e.spectra.omega, model.outputs, model.inputs
-    of_inputs, of_outputs = _over(e.spectra, mean), _over(e.spectra, y)
     for error in errors:
         if error.kind == "fixed":
             yield of.slopes(mean, [turned.derivative(at.theta, error.channel)])[:, :, 0]
@@ -253,12 +252,11 @@ def _columns(
         if error.channel in inputs:  # a gain is of what is logged, a lag of what acts, but for a measured current
             k = inputs.index(error.channel)
             sign = -1.0 if error.kind == "gain" or error.channel.endswith("_current") else 1.0
-            moved = of_inputs[:, k] if error.kind == "limiter" else logged_error(error.kind, mean[:, k], omega)
-            yield sign * H[:, :, k] * moved[:, None]
+            yield sign * H[:, :, k] * _at_lines(e.spectra, error.kind, mean[:, k])[:, None]
             continue
         added, k = np.zeros_like(y), outputs.index(error.channel)
         other = y[:, outputs.index(error.other)] if error.other else None
-        added[:, k] = of_outputs[:, k] if error.kind == "limiter" else logged_error(error.kind, y[:, k], omega, other)
+        added[:, k] = _at_lines(e.spectra, error.kind, y[:, k], other)
         yield added
     forced = _forced(of, model, at, mean, y)
     yield -1j * omega[:, None] * forced
@@ -266,18 +264,21 @@ def _columns(
 
 
 def beyond_ends(x: Array) -> Array:
-    """Return the parts of signals (n, n_signals) beyond the outer twentieth of each."""
+    """Return the parts of signals, time first, beyond the outer twentieth of each."""
     ends = np.quantile(np.abs(x), _ENDS, axis=0)
     return np.asarray(x - np.clip(x, -ends, ends))
 
 
-def _over(spectra: PeriodSpectra, lines: Complex) -> Complex:
-    """Return the lines of signals (n_lines, n) beyond their outer twentieth; zeros where they are not of one period."""
+def _at_lines(spectra: PeriodSpectra, kind: Kind, signal: Complex, other: Complex | None = None) -> Complex:
+    """Return what an error of one unit adds to a channel's lines (n_lines,); a limiter's part beyond the outer
+    twentieth is zero where the lines are not those of one period.
+    """
+    if kind != "limiter":
+        return logged_error(kind, signal, spectra.omega, other)
     bins = _bins(spectra)
     if spectra.known_scatter is not None or np.any(np.diff(bins) <= 0):
-        return np.zeros_like(lines)
-    over = beyond_ends(np.stack([_course(x, bins, spectra.period) for x in lines.T], axis=1))
-    return np.asarray(np.fft.rfft(over, axis=0)[bins] / spectra.period)
+        return np.zeros_like(signal)
+    return np.asarray(np.fft.rfft(beyond_ends(_course(signal, bins, spectra.period)))[bins] / spectra.period)
 
 
 def _bins(spectra: PeriodSpectra) -> NDArray[np.intp]:
@@ -325,10 +326,10 @@ def _freed(spectra: PeriodSpectra, model: RotorModel, error: SensorError, size: 
     U, Y, late = spectra.U.copy(), spectra.Y.copy(), 1.0 + 1j * spectra.omega * size
     if error.kind == "limiter" and error.channel in model.outputs:
         k = model.outputs.index(error.channel)
-        Y[:, :, k] -= size * _over(spectra, spectra.mean_y)[:, k]
+        Y[:, :, k] -= size * _at_lines(spectra, error.kind, spectra.mean_y[:, k])
     elif error.kind == "limiter":
         k = model.inputs.index(error.channel)
-        U[:, :, k] += size * _over(spectra, spectra.mean_u)[:, k]
+        U[:, :, k] += size * _at_lines(spectra, error.kind, spectra.mean_u[:, k])
     elif error.channel in model.inputs:
         acts = 1.0 / late if not error.channel.endswith("_current") else late
         U[:, :, model.inputs.index(error.channel)] *= acts if error.kind == "lag" else 1.0 / (1.0 + size)
