@@ -666,8 +666,12 @@ def _check_consistent(estimate: Estimate) -> None:
         raise ValueError("the operating point is not that of the inputs and outputs")
     if at.A.shape != (n, n) or at.B.shape != (n, len(plant.inputs)) or at.C.shape != (n_y, n):
         raise ValueError("the continuous plant is not of the model's size")
-    if estimate.noise.gain.shape != (n, n_y) or estimate.noise.innovation_covariance.shape != (n_y, n_y):
-        raise ValueError("the noise model is not of the model's size")
+    colours = estimate.whole_noise.colours
+    if estimate.noise.colours or any(c.source not in (*plant.disturbances, *plant.outputs) for c in colours):
+        raise ValueError("the coloured noise is not of the model's disturbances and outputs")
+    for noise, more in ((estimate.noise, 0), (estimate.whole_noise, sum(c.order for c in colours))):
+        if noise.gain.shape != (n + more, n_y) or noise.innovation_covariance.shape != (n_y, n_y):
+            raise ValueError("the noise model is not of the model's size")
     size = len(estimate.covariance_names)
     if set(estimate.covariance_names) - set(specs) or estimate.covariance.shape != (size, size):
         raise ValueError("the covariance is not of the parameters")

@@ -162,7 +162,7 @@ def spectra_of(bench: Record, of: LinearModel, speed: float = 0.0) -> PeriodSpec
     frequency: Array = np.asarray(lines * (bench.rate_hz / bench.n_samples), dtype=np.float64)
     return PeriodSpectra(
         frequency_hz=frequency, U=U[None, lines], Y=Y[None, lines], R=R[lines],
-        rate_hz=bench.rate_hz, period=bench.n_samples, dropped=0, left_out_hz=np.empty(0),
+        rate_hz=bench.rate_hz, period=bench.n_samples, dropped=0,
         between=Between(frequency_hz=np.empty(0), U=U[:0], Y=Y[:0]),
     )  # fmt: skip
 

@@ -417,7 +417,7 @@ class RotorRecord:
     @property
     def name(self) -> str:
         """The name of its file."""
-        return str(self.bench.provenance.get("file") or "record")
+        return name_of(self.bench)
 
 
 def read_records(

@@ -14,7 +14,7 @@ from ambid.arrays import Array, Complex
 from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 from ambid.physics.rotor_model import RotorModel
 
-Kind = Literal["gain", "offset", "zero", "lag", "cross-talk", "fixed"]
+Kind = Literal["gain", "offset", "zero", "lag", "cross-talk", "limiter", "fixed"]
 CHANNELS = ("voltage", "current", "position", "time")
 _LINES, _BEYOND = 60, 10.0  # of the default frequencies, and the factor by which they reach beyond the poles
 _RANK = 1e-9  # relative singular value of directions that no parameter is moved along
@@ -35,6 +35,11 @@ class SensorError:
     kind: Kind
     channel: str  # role of an input or output, "time", or the name of a fixed number
     other: str = ""  # channel that a cross-talk is of
+
+    @property
+    def moves_signal(self) -> bool:
+        """Whether its column is a signal's own, and no derivative of the matrices of a plant."""
+        return self.kind == "limiter" or (self.kind == "lag" and not self.channel.endswith("_position"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,11 +73,11 @@ def other_plane(model: RotorModel, k: int) -> int | None:
 
 
 def electrical_errors(model: RotorModel) -> tuple[SensorError, ...]:
-    """Return the errors that a rotor's currents, voltages and commands may have; a voltage lags where its amplifier
-    does.
+    """Return the errors that a rotor's currents, voltages and commands may have; a voltage lags, or is limited, where
+    its amplifier does.
     """
     roles = (*(x for x in model.outputs if x.endswith("_current")), *model.inputs)
-    return tuple(SensorError(kind=kind, channel=role) for kind in ("gain", "lag") for role in roles)
+    return tuple(SensorError(kind=kind, channel=role) for kind in ("gain", "lag", "limiter") for role in roles)
 
 
 def position_errors(model: RotorModel) -> tuple[SensorError, ...]:

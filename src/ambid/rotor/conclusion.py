@@ -64,17 +64,14 @@ class Numbers:
 
 def numbers_of(fit: Ending) -> Numbers:
     """Return numbers and covariance by the names of the model."""
-    unknowns, point = fit.unknowns, fit.point
-    names, chain = unknowns.chain(fit.vector)
-    roles = [f"{role}.delay" for role in unknowns.model.inputs]
-    keep = [*range(len(names)), *(len(names) + k for k in unknowns.free_delays)]
-    data = fit.seen
-    half = chain[keep] @ data.root()
+    unknowns, data = fit.unknowns, fit.seen
+    names, chain = unknowns.estimated(fit.vector)
+    half = chain @ data.root()
     last = data.Vt[-1] if data.Vt.size else np.zeros(0)
     heavy = np.argsort(-np.abs(last))[:4]
     return Numbers(
-        theta=point.theta,
-        names=(*names, *(roles[k] for k in unknowns.free_delays)),
+        theta=fit.point.theta,
+        names=names,
         covariance=half @ half.T,
         weakest={unknowns.names[k]: float(last[k]) for k in heavy},
         condition=data.condition,
@@ -90,26 +87,34 @@ class Evidence:
     fit: Mapping[str, OutputFit]
     checks: Mapping[str, Check]
     bent: Bent | None = None  # what curvature has done to the numbers
-    shifts: Sequence[Array] = ()  # what causes that are named have done to them, in order of `Numbers.names`
+    # beside what the record itself leaves open, in order of `Numbers.names`, each (n,) or (n_ways, n): what causes that
+    # are named have done to the numbers, and what residuals that are no noise say
+    shifts: Sequence[Array] = ()
 
 
 def of_periods(fit: RotorFit) -> Evidence:
     """Return the evidence of period spectra."""
     found, numbers = refined(fit.problem, fit.vector, scores(fit.problem, fit.vector)), numbers_of(fit)
-    sd = {name: numbers.sd(name) for name in numbers.names}
+    sd, bent = {name: numbers.sd(name) for name in numbers.names}, curvature(fit.problem, fit.vector)
+    if bent and bent.shift and curvature_check(bent, sd, told=False).passed:  # magnets that bend do so at the ends too
+        found = [s for s in found if s.cause.kind != "limiter" or s.gain > bent.gain]
     more, second = beside(fit.problem, fit.vector, found)
-    agree, bent = agreement_checks(found, fit.model, second), curvature(fit.problem, fit.vector)
+    agree = agreement_checks(found, fit.model, second)
     named = next((c.cause for c in agree.values() if not c.passed), "")
     if bent and bent.shift and named and bent.gain < found[0].gain:  # no more than what is named does
         bent = bent.instead(named)
-    residual = _residual_checks(fit)
+    residual, shifts = _residual_checks(fit), [*shifts_of(fit, found), *shifts_of(fit, more)]
     told = not all(c.passed for c in (*residual.values(), *agree.values()))
+    if not all(c.passed for c in residual.values()):  # what no cause explains
+        left = fit.problem.cost(fit.vector) - (found[0].gain if suspects(found) else 0.0)
+        _, chain = fit.unknowns.estimated(fit.vector)
+        shifts.append(np.sqrt(max(left / fit.problem.n_real - 1.0, 0.0)) * (chain @ fit.seen.root()).T)
     return Evidence(
         method="periods",
         noise=_noise(fit),
         fit=_fits(fit),
         bent=bent,
-        shifts=[*shifts_of(fit, found), *shifts_of(fit, more)],
+        shifts=shifts,
         checks={
             **residual,
             **({"curvature": curvature_check(bent, sd, told=told)} if bent else {}),
@@ -120,16 +125,16 @@ def of_periods(fit: RotorFit) -> Evidence:
 
 def shifts_of(fit: Ending, found: Sequence[Score]) -> list[Array]:
     """Return by how much each cause that is named has moved the numbers, and how far that is known."""
-    names, chain = fit.unknowns.chain(fit.vector)
+    names, chain = fit.unknowns.estimated(fit.vector)
     free, n, shifts = list(fit.unknowns.free_delays), fit.vector.size, list[Array]()
+    names = names[: len(names) - len(free)]
     logs = [k for k, x in enumerate(fit.unknowns.names) if k < len(fit.unknowns.logs) or x.endswith(".l")]
     for s in suspects(found):
         shift = s.shift[:n].copy()
         shift[logs] = np.clip(shift[logs], -FOLD, FOLD)
         points = (fit.point, replace(fit, vector=fit.vector - shift).point)
         is_now, would_be = (np.array([*(p.theta[x] for x in names), *p.delays[free]]) for p in points)
-        spread = chain[[*range(len(names)), *(len(names) + k for k in free)]] @ s.spread[:n]
-        shifts += [is_now - would_be, spread]
+        shifts += [is_now - would_be, chain @ s.spread[:n]]
     return shifts
 
 
@@ -161,8 +166,8 @@ def conclude(
     numbers, model = (of_record := numbers_of(fit)), fit.model
     if evidence.bent is not None:
         numbers = numbers.wider(tuple(evidence.bent.shift), evidence.bent.more)
-    for x in evidence.shifts:
-        numbers = numbers.wider(numbers.names, np.outer(x, x))
+    for x in map(np.atleast_2d, evidence.shifts):
+        numbers = numbers.wider(numbers.names, x.T @ x)
     estimated = _parameters(model, parameters, numbers, of_record)
     checks = {**evidence.checks, "identifiable": _identifiable(estimated, numbers), **more_checks}
     speed = max(fit.speeds, key=abs)

@@ -79,7 +79,6 @@ class RotorFit(Ending):
 
     problem: Likelihood
     cost: float
-    last_step: float  # squared length of the last step, in standard deviations
 
 
 def estimate_rotor(
@@ -106,46 +105,8 @@ def estimate_rotor(
             f"{names} move no more than their noise, and at rest no other axis moves them. Excite them too, or omit "
             "them from the rig: the others are identified without"
         )
-    work = _Work(
-        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), modes=modes,
-        tick=tick,
-    )  # fmt: skip
+    work = Work(model=model, parameters=parameters, delays=delays, modes=modes, tick=tick)
     return work.finish(ordered, *work.start(ordered))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Starter:
-    """Start values from spectra whose noise is known beforehand."""
-
-    model: RotorModel
-    parameters: Sequence[Parameter]
-    delays: Sequence[float | None]  # of each input in samples, None where it is searched
-    modes: RigModes
-    tick: Tick
-
-    def begin(self, experiments: Sequence[Experiment]) -> tuple[RotorModel, Point]:
-        """Return the model with the modes that are clearly there, and its numbers."""
-        ordered = sorted(experiments, key=lambda e: abs(e.speed))
-        work = self._work(self.model.at_speed(ordered[0].speed))
-        return work.refine(ordered, *work.start(ordered))
-
-    def one_more(
-        self, experiments: Sequence[Experiment], model: RotorModel, at: Point
-    ) -> tuple[RotorModel, Point] | None:
-        """Return model and numbers with one mode more, None where the spectra do not ask for it."""
-        ordered, work = sorted(experiments, key=lambda e: abs(e.speed)), self._work(model)
-        try:
-            at, cost = work.rough(ordered, model, at, relative=_REFINED)
-            more = work.candidate(ordered, model, at, cost)
-        except np.linalg.LinAlgError:  # ran off
-            return None
-        return None if more is None else _in_order(*more[:2])
-
-    def _work(self, model: RotorModel) -> _Work:
-        return _Work(
-            model=model, parameters=tuple(self.parameters), delays=tuple(self.delays), modes=self.modes,
-            tick=self.tick,
-        )  # fmt: skip
 
 
 def unknowns_at(model: RotorModel, parameters: Sequence[Parameter], at: Point, free: Sequence[int]) -> Unknowns:
@@ -158,12 +119,28 @@ def unknowns_at(model: RotorModel, parameters: Sequence[Parameter], at: Point, f
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Work:
+class Work:
+    """The steps to an estimate, of which the predictor takes those to start values."""
+
     model: RotorModel
-    parameters: tuple[Parameter, ...]
-    delays: tuple[float | None, ...]
+    parameters: Sequence[Parameter]
+    delays: Sequence[float | None]  # of each input in samples, None where it is searched
     modes: RigModes
     tick: Tick
+
+    def rough_start(self, experiments: Sequence[Experiment]) -> tuple[RotorModel, Point]:
+        """Return the model with the modes that are clearly there, and its numbers: of spectra whose noise is known."""
+        ordered = sorted(experiments, key=lambda e: abs(e.speed))
+        return self.refine(ordered, *self.start(ordered))
+
+    def one_more(self, e: Experiment, model: RotorModel, at: Point) -> tuple[RotorModel, Point] | None:
+        """Return model and numbers with one mode more, None where the spectra do not ask for it."""
+        try:
+            at, cost = self.rough([e], model, at, relative=_REFINED)
+            more = self.candidate([e], model, at, cost)
+        except np.linalg.LinAlgError:  # ran off
+            return None
+        return None if more is None else _in_order(*more[:2])
 
     def problem(
         self, experiments: Sequence[Experiment], model: RotorModel, at: Point, weights: Sequence[Weight]
@@ -192,10 +169,9 @@ class _Work:
 
     def start(self, ordered: Sequence[Experiment]) -> tuple[RotorModel, Point]:
         """Return model and numbers from the slowest records, then from the others."""
-        slowest = _slowest(ordered)
+        slowest, slow = _slowest(ordered), replace(self, model=self.model.at_speed(ordered[0].speed))
         first = [_together(slowest)]
-        edge, at = self.begin(first)
-        current, at = self.grow(first, edge, at)
+        current, at = slow.grow(first, *slow.begin(first))
         if len(ordered) > len(slowest):
             at = self.turn(ordered[len(slowest) :], current, at)
         return current, at
@@ -312,8 +288,9 @@ class _Work:
         whole = self._whole(fit)
         if whole is not None:
             delays = tuple(float(x) for x in whole)
-            settled = replace(self, delays=delays)
-            fit = settled.likely(experiments, fit.model, replace(fit.point, delays=np.array(delays)), fit)
+            fit = replace(self, delays=delays).likely(
+                experiments, fit.model, replace(fit.point, delays=np.array(delays)), fit
+            )
         return fit
 
     def likely(
@@ -338,7 +315,7 @@ class _Work:
         return RotorFit(
             unknowns=problem.unknowns, base=problem.base, problem=problem, vector=v, cost=cost,
             status="converged" if converged and last < 0.1 else "stalled",
-            last_step=last, triangle=triangle, band_hz=(min(float(x[0]) for x in f), max(float(x[-1]) for x in f)),
+            triangle=triangle, band_hz=(min(float(x[0]) for x in f), max(float(x[-1]) for x in f)),
             speeds=tuple(e.speed for e in experiments),
         )  # fmt: skip
 

@@ -167,5 +167,4 @@ def apart(spectra: PeriodSpectra, lines: Sequence[Line]) -> PeriodSpectra:
             f"the excitation of the record has {far.size} lines, on {np.count_nonzero(~far)} of which hum or another "
             f"tone stands; a rotor needs {LEAST_LINES} others. Excite more lines: a multisine with whole periods"
         )
-    kept = spectra.lines(far)
-    return replace(kept, left_out_hz=np.sort(np.concatenate([kept.left_out_hz, spectra.frequency_hz[~far]])))
+    return spectra.lines(far)

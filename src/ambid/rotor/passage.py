@@ -11,7 +11,7 @@ from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.physics.rotor_model import RotorModel, position_role
 from ambid.record import Record
-from ambid.rotor.synchronous import Source, angle_of_pulses
+from ambid.rotor.synchronous import Source, logged_angle
 from ambid.signals.orders import Orders, Waterfall, track_orders, waterfall
 
 _TURNS = 64  # that a run-up has; noise of a speed channel at rest makes none
@@ -32,15 +32,8 @@ class Turning:
 
 def turning_of(record: Record) -> Turning:
     """Return how the rotor turned: by its angle, pulses once a revolution, or the integral of its speed."""
-    rate = record.rate_hz
-    if "angle" in record:
-        return Turning(angle=np.unwrap(record["angle"].values), source="angle")
-    if "tacho" in record:
-        return Turning(angle=angle_of_pulses(record["tacho"].values, rate), source="tacho")
-    if "speed" in record:
-        w = record["speed"].values
-        angle = np.concatenate([[0.0], np.cumsum(0.5 * (w[1:] + w[:-1]))]) / rate
-        return Turning(angle=angle, source="speed")
+    if (logged := logged_angle(record)) is not None:
+        return Turning(angle=logged[0], source=logged[1])
     raise EstimationError(
         "the record has neither angle, tacho nor speed; orders over the speed need one of them. Log it, and name its "
         "column in [channels]"

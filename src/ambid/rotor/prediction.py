@@ -29,11 +29,12 @@ from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
 from ambid.physics.linear_model import Parameter, ParameterSpec, StateSpace, discretise
 from ambid.physics.rotor_model import RotorModel
+from ambid.physics.sensor_errors import SensorError
 from ambid.record import Record
 from ambid.rig.rotor import RigModes
-from ambid.rotor.estimator import Ending, Starter, unknowns_at
+from ambid.rotor.estimator import Ending, Work, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point
-from ambid.rotor.scores import Cause, Score, causes_of, scored
+from ambid.rotor.scores import Cause, Score, beyond_ends, causes_of, scored
 from ambid.rotor.spectra import PeriodSpectra, windowed_spectra
 from ambid.rotor.unknowns import Unknowns
 
@@ -145,7 +146,7 @@ class _Erring(Searched):
             elif error.channel in self.inputs and error.kind == "gain":
                 k = self.inputs.index(error.channel)
                 moved.B[:, k] -= space.B[:, k]
-            elif error.kind != "lag" or error.channel.endswith("_position"):  # see `_late_columns`
+            elif not error.moves_signal:
                 k = self.outputs.index(error.channel)
                 row = {"gain": space.C[k], "lag": -space.C[k] @ space.A}
                 moved.C[k] += row[error.kind] if error.kind in row else space.C[self.outputs.index(error.other)]
@@ -153,7 +154,7 @@ class _Erring(Searched):
 
 
 def predictor_scores(found: PredictorFit) -> list[Score]:
-    """Return the causes that the innovations may have: fixed numbers, gains, cross-talk, lags."""
+    """Return the causes that the innovations may have: fixed numbers, gains, cross-talk, lags, amplifiers' limits."""
     fit, searched = found.fit, searched_of(found.fit)
     causes = {c.name: c for c in causes_of(searched.unknowns) if c.errors}
     old, n, more = fit.problem, fit.problem.n_physical, len(causes)
@@ -164,10 +165,10 @@ def predictor_scores(found: PredictorFit) -> list[Score]:
         prior_mean=np.append(old.prior_mean, np.zeros(more)), prior_sd=np.append(old.prior_sd, np.full(more, np.inf)),
     )  # fmt: skip
     weight, vector = weight_of(fit.covariance), np.insert(fit.vector, n, np.zeros(more))
-    late, first, parts = _late_columns(fit, tuple(causes.values())), 0, list[Array]()
+    moved, first, parts = _moved_columns(fit, tuple(causes.values())), 0, list[Array]()
     for block in residual_blocks(problem, vector, weight, workspace_near(fit, problem)):
         rows = block.copy()
-        rows[:, :, n : n + more] += np.einsum("ij,tjk->tik", weight, late[first : first + len(rows)])
+        rows[:, :, n : n + more] += np.einsum("ij,tjk->tik", weight, moved[first : first + len(rows)])
         parts.append(triangle_of([rows.reshape(-1, problem.size + 1)]))
         first += len(rows)
     if not parts:
@@ -181,30 +182,32 @@ def predictor_scores(found: PredictorFit) -> list[Score]:
     return scored(tuple(causes.values()), C, J, -r, old.y.size)
 
 
-def _late_columns(fit: Fit, causes: Sequence[Cause]) -> Array:
-    """Return what lags of coils' channels, which move no matrix of the plant, do to the innovations, (n_used, n_y,
-    n_causes): an input moves by its own last step, an output by that from its last value to what is predicted.
+def _moved_columns(fit: Fit, causes: Sequence[Cause]) -> Array:
+    """Return what errors that move signals, and no matrix of the plant, do to the innovations, (n_used, n_y, n_causes):
+    of a limiter a signal by its part beyond the outer ones, of a lag an input by its own last step, an output by that
+    from its last value to what is predicted.
     """
     problem, plant = fit.problem, fit.problem.model
     e = innovations(problem, fit.vector)
     assert e is not None
     used = slice(problem.skip, None)
     predicted, columns = problem.y[used] - e * problem.scales.output, np.zeros((*e.shape, len(causes)))
-    of = dict[str, Array]()
+    of_inputs, of_outputs = beyond_ends(problem.u), beyond_ends(predicted)
+    of = dict[SensorError, Array]()
     for k, cause in enumerate(causes):
-        for error in (x for x in cause.errors if x.kind == "lag" and not x.channel.endswith("_position")):
-            if error.channel not in of:
-                u, y = problem.u.copy(), problem.y.copy()
+        for error in (x for x in cause.errors if x.moves_signal):
+            if error not in of:
+                u, y, limits = problem.u.copy(), problem.y.copy(), error.kind == "limiter"
                 if error.channel in plant.inputs:
                     j = plant.inputs.index(error.channel)
-                    u[1:, j] -= np.diff(problem.u[:, j])
+                    u[1:, j] += of_inputs[1:, j] if limits else -np.diff(problem.u[:, j])
                 else:
                     j = plant.outputs.index(error.channel)
-                    y[used, j] += predicted[:, j] - problem.y[problem.skip - 1 : -1, j]
+                    y[used, j] += of_outputs[:, j] if limits else predicted[:, j] - problem.y[problem.skip - 1 : -1, j]
                 moved = innovations(replace(problem, u=u, y=y), fit.vector)
                 assert moved is not None
-                of[error.channel] = problem.rate_hz * (moved - e)
-            columns[:, :, k] += of[error.channel]
+                of[error] = (1.0 if limits else problem.rate_hz) * (moved - e)
+            columns[:, :, k] += of[error]
     return columns
 
 
@@ -223,9 +226,9 @@ def predict_rotor(
     """
     tick("start", 0.0)
     spectra = windowed_spectra(record, model, speed)
-    experiments = [Experiment(spectra=spectra, speed=speed)]
-    starter = Starter(model=model, parameters=parameters, delays=delays, modes=modes, tick=tick)
-    found, at = starter.begin(experiments)
+    experiment = Experiment(spectra=spectra, speed=speed)
+    work = Work(model=model, parameters=parameters, delays=delays, modes=modes, tick=tick)
+    found, at = work.rough_start([experiment])
     near = np.array([np.round(x) if d is None else d for x, d in zip(at.delays, delays, strict=True)])
     skip = int(near.max()) + _REST
 
@@ -242,7 +245,7 @@ def predict_rotor(
         return problem, vector
 
     fit = _search(*problem_at(found.at_speed(speed), replace(at, delays=near)), tick)
-    while (more := starter.one_more(experiments, _rotor_of(fit), _point_of(fit))) is not None:
+    while (more := work.one_more(experiment, _rotor_of(fit), _point_of(fit))) is not None:
         price = float(np.log(fit.problem.y.size)) * (3 + len(model.places))
         trial = search(*problem_at(more[0].at_speed(speed), replace(more[1], delays=near), last=fit))
         if trial.status == "failed" or not fit.criterion - trial.criterion > price:

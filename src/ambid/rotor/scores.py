@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
@@ -16,7 +17,7 @@ from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.rotor_model import RotorModel
-from ambid.physics.sensor_errors import SensorError, electrical_errors, logged_error, position_errors
+from ambid.physics.sensor_errors import Kind, SensorError, electrical_errors, logged_error, position_errors
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, sampled
 from ambid.rotor.response import Sampled
 from ambid.rotor.spectra import PeriodSpectra
@@ -29,6 +30,7 @@ _CLOSE = 9.0  # and the difference of gains within which it does in any case
 _LARGE = 1.5  # mean square of the residuals from which an error is not of first order
 _MAIN = 0.5  # part of what the model leaves, that curvature or a second cause has to explain
 _WORTH, _MOST, _STEPS = 0.1, 8, 30  # part of the best gain from which a cause is searched, how many, steps
+_ENDS = 0.95  # quantile of a signal beyond which an amplifier or a sensor may limit
 _TOGETHER = {"position": "positions", "current": "currents", "voltage": "voltages"}
 
 
@@ -46,7 +48,8 @@ class Cause:
     """Errors of one size that have one cause."""
 
     name: str  # as `Check.cause`: "ax_current.gain", "A.z", "A.z+A.z_sensor", "positions.lag", "solid_iron"
-    kind: str  # "fixed", "gain", "lag", "cross-talk", "eddy" (f = k_i i/(1 + s/a)), "iron" (k_i i/(1 + (s/a)^0.5))
+    # "fixed", "gain", "lag", "cross-talk", "limiter", "eddy" (f = k_i i/(1 + s/a)), "iron" (k_i i/(1 + (s/a)^0.5))
+    kind: str
     errors: tuple[SensorError, ...] = ()
 
 
@@ -73,10 +76,10 @@ def causes_of(unknowns: Unknowns) -> tuple[Cause, ...]:
             causes.append(Cause(name="+".join(planes), kind="fixed", errors=both))
     errors = (*position_errors(model), *electrical_errors(model))
     causes += [Cause(name=f"{e.channel}.{e.kind}", kind=e.kind, errors=(e,)) for e in errors]
-    lags = [e for e in errors if e.kind == "lag"]
-    for of, group in groupby(lags, lambda e: e.channel.split("_")[1].rstrip("0123456789")):
+    shared = [e for e in errors if e.kind in ("lag", "limiter")]
+    for (kind, of), group in groupby(shared, lambda e: (e.kind, e.channel.split("_")[1].rstrip("0123456789"))):
         if len(all_of := tuple(group)) > 1 and of in _TOGETHER:
-            causes.append(Cause(name=f"{_TOGETHER[of]}.lag", kind="lag", errors=all_of))
+            causes.append(Cause(name=f"{_TOGETHER[of]}.{kind}", kind=kind, errors=all_of))
     eddy = () if "a" in model.extras else (Cause(name="eddy_pole", kind="eddy"),)
     return (*causes, *eddy, Cause(name="solid_iron", kind="iron"))
 
@@ -246,19 +249,41 @@ def _columns(
         if error.kind == "fixed":
             yield of.slopes(mean, [turned.derivative(at.theta, error.channel)])[:, :, 0]
             continue
-        added = np.zeros_like(y)
         if error.channel in inputs:  # a gain is of what is logged, a lag of what acts, but for a measured current
             k = inputs.index(error.channel)
             sign = -1.0 if error.kind == "gain" or error.channel.endswith("_current") else 1.0
-            yield sign * H[:, :, k] * logged_error(error.kind, mean[:, k], omega)[:, None]
+            yield sign * H[:, :, k] * _at_lines(e.spectra, error.kind, mean[:, k])[:, None]
             continue
-        k = outputs.index(error.channel)
+        added, k = np.zeros_like(y), outputs.index(error.channel)
         other = y[:, outputs.index(error.other)] if error.other else None
-        added[:, k] = logged_error(error.kind, y[:, k], omega, other)
+        added[:, k] = _at_lines(e.spectra, error.kind, y[:, k], other)
         yield added
     forced = _forced(of, model, at, mean, y)
     yield -1j * omega[:, None] * forced
     yield -np.sqrt(1j * omega)[:, None] * forced
+
+
+def beyond_ends(x: Array) -> Array:
+    """Return the parts of signals, time first, beyond the outer twentieth of each."""
+    ends = np.quantile(np.abs(x), _ENDS, axis=0)
+    return np.asarray(x - np.clip(x, -ends, ends))
+
+
+def _at_lines(spectra: PeriodSpectra, kind: Kind, signal: Complex, other: Complex | None = None) -> Complex:
+    """Return what an error of one unit adds to a channel's lines (n_lines,); a limiter's part beyond the outer
+    twentieth is zero where the lines are not those of one period.
+    """
+    if kind != "limiter":
+        return logged_error(kind, signal, spectra.omega, other)
+    bins = _bins(spectra)
+    if spectra.known_scatter is not None or np.any(np.diff(bins) <= 0):
+        return np.zeros_like(signal)
+    return np.asarray(np.fft.rfft(beyond_ends(_course(signal, bins, spectra.period)))[bins] / spectra.period)
+
+
+def _bins(spectra: PeriodSpectra) -> NDArray[np.intp]:
+    """Return the place of each line in the spectrum of a period."""
+    return np.round(spectra.frequency_hz * spectra.period / spectra.rate_hz).astype(np.intp)
 
 
 def _forced(of: Sampled, model: RotorModel, at: Point, U: Complex, Y: Complex) -> Complex:
@@ -299,7 +324,13 @@ def _without(problem: Likelihood, v: Array, cause: Cause, size: float) -> Likeli
 
 def _freed(spectra: PeriodSpectra, model: RotorModel, error: SensorError, size: float) -> PeriodSpectra:
     U, Y, late = spectra.U.copy(), spectra.Y.copy(), 1.0 + 1j * spectra.omega * size
-    if error.channel in model.inputs:
+    if error.kind == "limiter" and error.channel in model.outputs:
+        k = model.outputs.index(error.channel)
+        Y[:, :, k] -= size * _at_lines(spectra, error.kind, spectra.mean_y[:, k])
+    elif error.kind == "limiter":
+        k = model.inputs.index(error.channel)
+        U[:, :, k] += size * _at_lines(spectra, error.kind, spectra.mean_u[:, k])
+    elif error.channel in model.inputs:
         acts = 1.0 / late if not error.channel.endswith("_current") else late
         U[:, :, model.inputs.index(error.channel)] *= acts if error.kind == "lag" else 1.0 / (1.0 + size)
     elif error.kind == "cross-talk":
@@ -319,6 +350,7 @@ def agreement_checks(found: Sequence[Score], model: RotorModel, more: Sequence[S
     best, units = found[0], {p.name: p.unit for p in model.parameters}
     alike = _alike(found)
     others = [s.cause.name for s in alike] + ["planes"] * ("+" in best.cause.name)
+    others += ["curvature"] * (best.cause.kind == "limiter")
     twin = next((best.cause.name.replace(a, b) for a, b in _TWINS if best.cause.name.endswith(a)), "")
     twins = _late_instead(best.cause.name) if _leads(best) else (twin,)
     others += [x for x in twins if x not in (best.cause.name, *others) and _logged(x, model)]
@@ -335,7 +367,7 @@ def agreement_checks(found: Sequence[Score], model: RotorModel, more: Sequence[S
         detail = fine if abs(worst.z) < _FAR else f"{best.cause.name} explains more than what this check asks for"
         if not passed:
             detail = _words(worst, units.get(worst.cause.name.split("+")[0], "1"))
-            words = {"planes": "two planes, each by its own"}
+            words = {"planes": "two planes, each by its own", "curvature": "curvature of the magnets"}
             shown = [_shown(s, units) for s in alike] + [words.get(x, x) for x in others[len(alike) :]]
             if shown:
                 detail += f"; about as well explained by {' or '.join(shown)}"
@@ -430,6 +462,12 @@ def _words(s: Score, unit: str) -> str:
             f"({sure}), as eddy currents in solid iron do: the intervals hold that. Excite more slowly, or let the "
             "iron be laminated"
         )
+    if kind == "limiter":
+        voltage = channel.rpartition("_")[2].startswith("voltage")
+        whose, remedy = (
+            ("the coils get", "Log the coils' voltages, or") if voltage else (f"{channel} read", "Calibrate, or")
+        )
+        return f"{whose} {100 * s.size:+.3g} % ({sure}) beyond the outer twentieth of {channel}. {remedy} excite less"
     if kind == "cross-talk":
         return (
             f"{channel} holds {100 * s.size:+.3g} % of the other plane ({sure}): cross-talk, or turned. Check its "
@@ -484,10 +522,8 @@ def curvature(problem: Likelihood, v: Array) -> Bent | None:
     p = chi_squared_tail(max(joint.sizes.size, 1), joint.gain / max(1.0, float(r @ r) / r.size))
     if p > _CHANCE:
         return Bent(gain=joint.gain, p=p, shift={}, more=np.zeros((0, 0)))
-    names, chain = problem.unknowns.chain(v)
-    late = problem.unknowns.free_delays
-    of_sizes = chain[[*range(len(names)), *(len(names) + k for k in late)]] @ joint.shift
-    names = (*names, *(f"{model.inputs[k]}.delay" for k in late))
+    names, chain = problem.unknowns.estimated(v)
+    of_sizes = chain @ joint.shift
     shift = of_sizes @ joint.sizes
     more = np.outer(shift, shift) + (of_sizes / joint.information) @ of_sizes.T
     return Bent(
@@ -501,7 +537,7 @@ def _bent(problem: Likelihood, e: Experiment, w: Weight, at: Point) -> Array:
     model, spectra = problem.unknowns.model, e.spectra
     of, turned = sampled(e, model, at), model.at_speed(e.speed)
     x, n = of.states(spectra.mean_u), len(turned.coordinates)
-    bins = np.round(spectra.frequency_hz * spectra.period / spectra.rate_hz).astype(int)
+    bins = _bins(spectra)
     places, states, D = x[:, :n] @ turned.rows(at.theta)[0].T, list(turned.states), of.disturbed()
     columns = []
     for j, axis in enumerate(model.axes):
@@ -519,7 +555,7 @@ def _bent(problem: Likelihood, e: Experiment, w: Weight, at: Point) -> Array:
     return np.concatenate([block.real, block.imag])
 
 
-def _course(spectrum: Complex, bins: Array, period: int) -> Array:
+def _course(spectrum: Complex, bins: NDArray[np.intp], period: int) -> Array:
     """Return a signal over one period by its lines."""
     whole = np.zeros(period // 2 + 1, dtype=complex)
     whole[bins] = spectrum * period

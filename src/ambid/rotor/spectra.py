@@ -81,7 +81,6 @@ class PeriodSpectra:
     rate_hz: float
     period: int  # samples
     dropped: int  # samples before the first period that is used
-    left_out_hz: Array  # lines near harmonics of the speed
     between: Between  # empty of windowed spectra
     # variances of a spectrum where there is no second one to show them: of inputs and outputs, (n_lines, n)
     known_scatter: tuple[Array, Array] | None = None
@@ -122,7 +121,7 @@ class PeriodSpectra:
         return PeriodSpectra(
             frequency_hz=self.frequency_hz[keep], U=self.U[:, keep], Y=self.Y[:, keep],
             R=None if self.R is None else self.R[keep], rate_hz=self.rate_hz, period=self.period, dropped=self.dropped,
-            left_out_hz=self.left_out_hz, between=self._beside(keep),
+            between=self._beside(keep),
             known_scatter=None if (known := self.known_scatter) is None else (known[0][keep], known[1][keep]),
         )  # fmt: skip
 
@@ -143,7 +142,7 @@ def joined(spectra: Sequence[PeriodSpectra]) -> PeriodSpectra:
         frequency_hz=np.concatenate([s.frequency_hz for s in spectra]),
         U=np.concatenate([s.U[-n:] for s in spectra], axis=1), Y=np.concatenate([s.Y[-n:] for s in spectra], axis=1),
         R=np.concatenate(logged) if len(logged) == len(references) else None, rate_hz=first.rate_hz,
-        period=first.period, dropped=first.dropped, left_out_hz=np.concatenate([s.left_out_hz for s in spectra]),
+        period=first.period, dropped=first.dropped,
         known_scatter=(np.concatenate([k[0] for k in other]), np.concatenate([k[1] for k in other])) if other else None,
         between=Between.of([s.between for s in spectra]),
     )  # fmt: skip
@@ -294,7 +293,7 @@ def period_spectra(record: Record, model: LinearModel, run: Excitation, speed: f
     keep = lines[~near]
     return PeriodSpectra(
         frequency_hz=frequency[~near], U=U[:, keep], Y=Y[:, keep], R=R[keep] if logged else None, rate_hz=rate,
-        period=n, dropped=run.first, left_out_hz=frequency[near],
+        period=n, dropped=run.first,
         between=_between(record, model, run, keep, speed / (2.0 * np.pi)),
     )  # fmt: skip
 
@@ -334,7 +333,7 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     keep = lines[np.unique(np.linspace(0, lines.size - 1, _MOST_LINES).round().astype(int))]
     return PeriodSpectra(
         frequency_hz=frequency[keep], U=U[None, keep], Y=Y[None, keep], R=None, rate_hz=rate, period=n, dropped=0,
-        left_out_hz=np.zeros(0), known_scatter=(np.zeros((keep.size, U.shape[1])), noise[keep]),
+        known_scatter=(np.zeros((keep.size, U.shape[1])), noise[keep]),
         between=Between(frequency_hz=np.zeros(0), U=U[:0], Y=Y[:0]),
     )  # fmt: skip
 

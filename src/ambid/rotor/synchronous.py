@@ -107,22 +107,32 @@ def rotation_of(record: Record, model: RotorModel, excitation: Excitation | None
     revolution, else the line near the logged or given speed, or anywhere if the model has a polar moment of inertia.
     """
     n, rate = record.n_samples, record.rate_hz
-    if "angle" in record:
-        return _checked(np.unwrap(record["angle"].values), rate, "angle")
-    if "tacho" in record:
-        return _checked(angle_of_pulses(record["tacho"].values, rate), rate, "tacho")
-    if "speed" in record:
-        speed = record["speed"].values
-        turned: Array = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))]) / rate
-        if not abs(turned[-1]) > 2.0 * np.pi:
+    if (logged := logged_angle(record)) is not None:
+        angle, source = logged
+        if source == "speed" and not abs(angle[-1]) > 2.0 * np.pi:
             return None
-        return _by_lines(record, model, excitation, turned, _NEAR) or _checked(turned, rate, "speed")
+        near = _by_lines(record, model, excitation, angle, _NEAR) if source == "speed" else None
+        return near or _checked(angle, rate, source)
     if model.speed:
         first = np.linspace(0.0, model.speed * (n - 1) / rate, n)
         return _by_lines(record, model, excitation, first, _NEAR) or _checked(first, rate, "rig")
     if model.polar and {0, 1} <= set(model.planes):
         return _by_lines(record, model, excitation, np.zeros(n), None)
     return None
+
+
+def logged_angle(record: Record) -> tuple[Array, Source] | None:
+    """Return the angle of a rotor in rad, not wrapped, by its own channel, pulses once a revolution, or the integral of
+    its speed, and which; None without.
+    """
+    if "angle" in record:
+        return np.unwrap(record["angle"].values), "angle"
+    if "tacho" in record:
+        return angle_of_pulses(record["tacho"].values, record.rate_hz), "tacho"
+    if "speed" not in record:
+        return None
+    w = record["speed"].values
+    return np.concatenate([[0.0], np.cumsum(0.5 * (w[1:] + w[:-1]))]) / record.rate_hz, "speed"
 
 
 def _checked(angle: NDArray[np.floating[Any]], rate: float, source: Source) -> Rotation | None:

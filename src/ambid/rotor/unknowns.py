@@ -113,6 +113,12 @@ class Unknowns:
         slopes[row + np.array(self.free_delays, dtype=int), k + np.arange(len(self.free_delays))] = 1.0
         return names, slopes
 
+    def estimated(self, v: Array) -> tuple[tuple[str, ...], Array]:
+        """Return names of all that is estimated, delays last, and the derivatives by the vector."""
+        names, slopes = self.chain(v)
+        late = [f"{self.model.inputs[k]}.delay" for k in self.free_delays]
+        return (*names, *late), slopes[[*range(len(names)), *(len(names) + k for k in self.free_delays)]]
+
     def priors(self, v: Array) -> tuple[Array, Array]:
         """Return the rows of priors, slopes (n, n_v) and residuals (n,), both over their standard deviations."""
         rows, left, k = [], [], 0

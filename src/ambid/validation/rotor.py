@@ -47,8 +47,8 @@ def of_predictor(found: PredictorFit) -> Evidence:
     shifts, robust = shifts_of(found, causes), _robust(found, sums.scores)
     own = np.diag(numbers_of(found).covariance)
     checks["uncertainty_consistent"] = consistent_check(float(np.sqrt(np.max(robust / own))))
-    if not shifts and not all(c.passed for c in checks.values()):
-        shifts = [*np.diag(np.sqrt(np.maximum(robust - own, 0.0))), *_by_bands(found)]
+    if not all(c.passed for c in checks.values()):
+        shifts += [np.diag(np.sqrt(np.maximum(robust - own, 0.0))), _by_bands(found)]
         checks = {
             name: c if c.passed else replace(c, detail=f"{c.detail}; the intervals hold how far its parts disagree")
             for name, c in checks.items()
@@ -69,23 +69,17 @@ def of_predictor(found: PredictorFit) -> Evidence:
     )
 
 
-def _chain(found: PredictorFit) -> Array:
-    """Return the derivatives of `Numbers.names` by the unknowns."""
-    names, chain = found.unknowns.chain(found.vector)
-    return chain[[*range(len(names)), *(len(names) + k for k in found.unknowns.free_delays)]]
-
-
 def _robust(found: PredictorFit, scores: Array) -> Array:
     """Return the variance of each number by the scatter of stretches of the record."""
-    fit, chain = found.fit, _chain(found)
+    fit, (_, chain) = found.fit, found.unknowns.estimated(found.vector)
     whole = directions(np.vstack([fit.J, fit.J_prior])).inverse()[: chain.shape[1]]
     return np.asarray(np.sum((chain @ whole @ scatter(scores).T) ** 2, axis=1))
 
 
 def _by_bands(found: PredictorFit) -> Array:
     """Return how far each number moves without bands of the record, (n_bands, n_numbers)."""
-    moves = by_bands(found.fit)
-    return np.asarray(np.clip(moves, -FOLD, FOLD) @ _chain(found)[:, : moves.shape[1]].T)
+    moves, (_, chain) = by_bands(found.fit), found.unknowns.estimated(found.vector)
+    return np.asarray(np.clip(moves, -FOLD, FOLD) @ chain[:, : moves.shape[1]].T)
 
 
 def _told(check: Check, fit: Fit) -> Check:
