@@ -667,7 +667,9 @@ def _check_consistent(estimate: Estimate) -> None:
     if at.A.shape != (n, n) or at.B.shape != (n, len(plant.inputs)) or at.C.shape != (n_y, n):
         raise ValueError("the continuous plant is not of the model's size")
     colours = estimate.whole_noise.colours
-    if estimate.noise.colours or any(c.source not in (*plant.disturbances, *plant.outputs) for c in colours):
+    if estimate.noise.colours or any(
+        c.source not in (*plant.disturbances, *plant.outputs) or not c.omega > 0.0 for c in colours
+    ):
         raise ValueError("the coloured noise is not of the model's disturbances and outputs")
     for noise, more in ((estimate.noise, 0), (estimate.whole_noise, sum(c.order for c in colours))):
         if noise.gain.shape != (n + more, n_y) or noise.innovation_covariance.shape != (n_y, n_y):
