@@ -296,9 +296,7 @@ def extended(
     noises = [[c.colour] for c in found if c.colour and (c in strong or c.channel == cause.channel)]
     noises = [c for c in noises if not any(_same(c[0], h) for h in had)]
     louder = coloured(fit, noises) if noises else None
-    if louder is None:
-        return None
-    return _resettled(louder, means, plain, taken, len(had))
+    return None if louder is None else _resettled(louder, means, plain, taken, len(had))
 
 
 def worse(first: Mapping[str, Check], after: Mapping[str, Check]) -> bool:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ambid.bearing import magnet_estimate
-from ambid.bearing.magnet_estimate import balance, estimate_bearing
+from ambid.bearing.magnet_estimate import estimate_bearing
 from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
+from ambid.bearing.magnet_start import balance
 from ambid.errors import EstimationError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
