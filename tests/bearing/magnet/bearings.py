@@ -6,6 +6,7 @@ import numpy as np
 
 from ambid.bearing.magnet_problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.physics.coenergy_law import MagnetLaw, law_numbers
+from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.loop import Limits
 from ambid.physics.presets import Preset, preset
 from ambid.simulation import Simulation, simulate
@@ -28,7 +29,7 @@ LARGE = Motion(swing=0.30, swing_hz=2.0, volts=3.0, hold=20)
 
 
 def moved(bench: Preset, motion: Motion, n: int, seed: int) -> Simulation:
-    rng, rate, gap = np.random.default_rng(1000 + seed), bench.rate_hz, bench.plant.magnet.gap
+    rng, rate, gap = np.random.default_rng(1000 + seed), bench.rate_hz, numbers_of(bench)["s"]
     setpoint = motion.swing * gap * np.sin(2 * np.pi * (motion.swing_hz * np.arange(n) / rate + rng.random()))
     levels = rng.choice([-motion.volts, motion.volts], n // motion.hold + 1)
     return simulate(
@@ -51,7 +52,13 @@ def truth_of(bench: Preset) -> dict[str, float]:
     rest = {"sigma": 0.0, "L_rise": 0.0, "i_knee": 1.0, "c": plant.c, "g": plant.gravity, "a": 500.0, "tau": 3e-3,
             "x_offset": 0.0, "i_offset": 0.0, "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02, "m": plant.m,
             "R": plant.R}  # fmt: skip
-    return {**rest, **law_numbers(plant.magnet.coenergy)}
+    return {**rest, **numbers_of(bench)}
+
+
+def numbers_of(bench: Preset) -> dict[str, float]:
+    """Numbers of the magnet: of two that differ as its law has them."""
+    magnet = bench.plant.magnet
+    return dict(magnet.values) if isinstance(magnet, LawMagnet) else law_numbers(magnet.coenergy)
 
 
 def problem_of(

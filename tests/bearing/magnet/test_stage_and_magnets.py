@@ -9,11 +9,12 @@ from ambid.bearing.magnet_estimate import estimate_bearing
 from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import Parameter
 from ambid.physics.nonlinear import PowerStage
 from ambid.physics.presets import preset
 from ambid.validation.nonlinear_bearing import whiteness
-from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
+from tests.bearing.magnet.bearings import Motion, as_seen, moved, numbers_of, problem_of, truth_of
 
 KNOWN = {
     "m": Parameter(name="m", unit="kg"),
@@ -28,10 +29,10 @@ NOISE = [1e-7, 2e-3, 1.0, 0.05, 0.02, 0.01]
 BARS = {"k": 0.01, "s": 0.005, "m": 0.01, "R": 0.01, "L_leak": 0.1}
 
 
-def bench(*, k_asym=0.0, bias_asym=0.0, **plant):
+def bench(*, k_asym=0.0, i0_asym=0.0, **plant):
     b = preset("unstable-bearing")
-    magnet = replace(b.plant.magnet, k_asym=k_asym, bias_asym=bias_asym)
-    return replace(b, plant=replace(b.plant, magnet=magnet, **plant))
+    values = numbers_of(b) | {"k_asym": k_asym, "i0_asym": i0_asym}
+    return replace(b, plant=replace(b.plant, magnet=LawMagnet(law=UNEQUAL, values=values), **plant))
 
 
 def truth(b):
@@ -59,7 +60,7 @@ def right(fit, exact, bars):
 
 @pytest.fixture(scope="module")
 def unequal():
-    b = bench(k_asym=0.08, bias_asym=0.04)
+    b = bench(k_asym=0.08, i0_asym=0.04)
     return b, seen(b, 5000)
 
 
@@ -87,7 +88,7 @@ def test_equal_magnets_stay_equal():
 
 
 def test_a_small_motion_does_not_show_a_difference_and_says_so():
-    b = bench(k_asym=0.08, bias_asym=0.04)
+    b = bench(k_asym=0.08, i0_asym=0.04)
     record, known = seen(b, 3000, WEAK_MOTION), {**KNOWN, "k_asym": Parameter(name="k_asym", unit="1")}
     fit = estimate_bearing([record], known, laws=[EQUAL], extend=(), delay=1.0)
     found = uncertainty(fit)
