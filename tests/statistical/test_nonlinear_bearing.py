@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from ambid.bearing.magnet_likelihood import search, uncertainty
-from ambid.job.nonlinear_bearing import TakenRecord, judge_bearing
+from ambid.job.nonlinear_bearing import TakenRecord, grown_bearing
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
@@ -47,7 +47,7 @@ def outcomes() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         sds = np.sqrt(np.diag(known.information))
         numbers.append([(values[n] - truth[n]) / sd for n, sd in zip(known.names, sds, strict=True)])
         taken = [TakenRecord(record=record, bench=done.record, remembered={}, warnings=(), start_s=0.0)]
-        found = judge_bearing(fit, known, taken, rig).curves(x, i)
+        found = grown_bearing(fit, taken, rig).curves(x, i)
         curves.append(
             [(c.value - exact[:, j]) / c.sd for j, c in enumerate((found.force, found.k_x, found.k_i, found.L))]
         )
