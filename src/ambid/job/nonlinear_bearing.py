@@ -294,14 +294,18 @@ def _judged(fit: BearingFit, readings: Sequence[TakenRecord], rig: Rig) -> tuple
     residuals = whiteness_checks(tests)
     alone = agreement(fit, spread, alone=True)
     residuals |= {"records_agree": agreement_check(alone)} if alone.strides else {}
-    robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
+    failed = not all(c.passed for c in residuals.values())
+    robust = failed or spread.inflation > _INFLATION or fit.status != "converged"
     moves = [alone.beyond_chance(), agreement(fit, spread, alone=False).beyond_chance()] if robust else []
     told, contradicted = record_facts(fit, spread, [t.bench for t in readings], names, rig, robust=robust)
     given = rig.channel("voltage").delay != "auto"
+    spread = replace(spread, disagreement=np.vstack([*moves, contradicted]))
+    sd = np.sqrt(np.diag(spread.covariance(robust=robust)))  # as stated: what moves numbers within it does no harm,
+    sd[np.isin(spread.names, "tau")] = np.inf  # nor what moves the noise
     found, named, biased = _causes(
-        fit, spread, {**told, **residuals}, tests, readings, robust=robust, delay_given=given
+        fit, sd, {**told, **residuals}, tests, readings, robust=robust, failed=failed, delay_given=given
     )
-    spread = replace(spread, disagreement=np.vstack([*moves, contradicted, biased]))
+    spread = replace(spread, disagreement=np.vstack([spread.disagreement, biased]))
     wide = robust or bool(np.any(spread.disagreement))
     parameters = _parameters(fit, spread, robust=wide)
     checks = {**told, **residuals, **named, "identifiable": _shown(parameters)} | _gravity(fit) | _law(fit)
@@ -350,23 +354,24 @@ def _delays(fit: BearingFit, spread: BearingUncertainty, *, given: bool) -> dict
 
 
 def _causes(
-    fit: BearingFit, spread: BearingUncertainty, checks: Mapping[str, Check], tests: Sequence[Whiteness],
-    readings: Sequence[TakenRecord], *, robust: bool, delay_given: bool,
+    fit: BearingFit, sd: Array, checks: Mapping[str, Check], tests: Sequence[Whiteness],
+    readings: Sequence[TakenRecord], *, robust: bool, failed: bool, delay_given: bool,
 ) -> tuple[list[Cause], dict[str, Check], Array]:  # fmt: skip
     """Return the causes that the innovations of the moving record which fits worst may have, judged, and how far those
-    seen, and bands left out where checks failed (`robust`), move the numbers, (n_moves, n), SI.
+    seen, and bands left out where deviations are `robust`, move the numbers, (n_moves, n), SI; `failed`: whether a test
+    of the innovations did.
     """
     worst = min((r for r, x in enumerate(fit.problem.records) if not x.held), key=lambda r: tests[r].p)
-    look, own = bearing_look(fit, worst), np.sqrt(np.diag(spread.information))
+    look = bearing_look(fit, worst)
     if look is None:
-        return [], {"causes": Check(passed=True, detail="no cause could be looked for")}, np.zeros((0, own.size))
+        return [], {"causes": Check(passed=True, detail="no cause could be looked for")}, np.zeros((0, sd.size))
     found, judged = list[Cause](), dict[str, Check]()
     for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
         found = bearing_causes(look, thorough=thorough, delay_given=delay_given)
-        judged = causes_check(found, checks, own, robust=robust, record=readings[worst].bench)
+        judged = causes_check(found, checks, sd, robust=failed, record=readings[worst].bench)
         if judged["causes"].passed:
             break
-    return found, judged, np.vstack([named_bias(found, np.zeros(own.size)), *([look.bands()] if robust else [])])
+    return found, judged, np.vstack([named_bias(found, np.zeros(sd.size)), *([look.bands()] if robust else [])])
 
 
 def _fits(fit: BearingFit, names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:

@@ -140,7 +140,7 @@ def bearing_look(fit: BearingFit, r: int) -> BearingLook | None:
     """
     whole, n_kept = fit.problem, fit.problem.noise_slices[0].start
     record = whole.records[r].part(busiest(whole.records[r].u[:, None], _LONGEST))
-    problem = replace(whole, records=(record,), noise_center=whole.noise_center[[r]])
+    problem = replace(whole, records=(replace(record, zero=None),), noise_center=whole.noise_center[[r]])
     vector = np.concatenate([fit.vector[:n_kept], fit.vector[whole.noise_slices[r]]])
     base = Innovations.of(record.u.size)
     assert fit.at is not None

@@ -281,7 +281,8 @@ def record_facts(
         values_of = {role: record.u if role == "voltage" else bench[role].values for role in roles}
         own = tuple(replace(bench[role], values=x[first:end]) for role, x in values_of.items())
         bench = replace(bench, channels=own, start_s=bench.start_s + first / bench.rate_hz)
-        known = outputs if np.any(record.loose > 0.0) else roles  # a stage that is off is no limit
+        # a stage that is off is no limit, and one that the rig says is taken as it is
+        known = outputs if np.any(record.loose > 0.0) or rig.limits is not None else roles
         checks = {**facts(bench, rig), **signal_checks(bench[[*known]], outputs)}
         if robust:
             checks["resolution"] = resolution_check(bench, {k: x**2 for k, x in innovation_sd(fit, r).items()})
