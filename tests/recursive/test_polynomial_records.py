@@ -30,6 +30,7 @@ def test_innovations_are_those_of_a_model_fitted_to_each_record(structure: str, 
     fitted = getattr(polynomial, structure)
     before, rest = whole[0].part(0, half), whole[0].part(half, whole[0].n_samples)
     r = RecursivePolynomial.from_fit(fitted(before, orders), samples=half, forgetting=0.999)
+    r.prime(before.u, before.y)
     for k, data in enumerate((rest, *whole[1:])):
         if k:
             r.update(np.nan, np.nan)  # another day, another operating point

@@ -54,7 +54,7 @@ class RecursivePolynomial(Copied):
     are consistent under feedback as long as their noise model holds the true one. An unstable plant needs A (arx,
     armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
 
-    A root of C or F near the border means a long memory: at the start and after every gap, nothing is
+    A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
     learnt until the unknown states of the filters have died away (`counts`). Where no search of the largest first
     window converged, `fit` says "stalled" and standard deviations are as large as the coefficients, until a later one
     does.
@@ -285,6 +285,33 @@ class RecursivePolynomial(Copied):
             u[0, 0], y[0] = inputs, outputs
             self._run(u, y, e)
             return np.array(e[0])
+        return self._take(inputs, outputs, learn=True)
+
+    def prime(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
+        """Let samples that were used before fill the memory of the filters, and learn nothing from them.
+
+        A fit that goes on where its record ended so loses no sample to the start of the filters.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
+        outputs : array_like, shape () or (n_samples,) or (n_samples, 1)
+
+        Returns
+        -------
+        ndarray, shape of `outputs`
+            Errors of prediction with the present coefficients.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit, or there is no estimate yet.
+        """
+        if self._state is None:
+            raise EstimationError(f"{self._who.structure}: no estimate yet; only one can be primed. Use from_fit")
+        return self._take(inputs, outputs, learn=False)
+
+    def _take(self, inputs: ArrayLike, outputs: ArrayLike, *, learn: bool) -> Array:
         given = np.zeros((np.size(outputs), 0)) if not self._n_u and inputs is None else inputs
         u, v, shape = as_blocks(self._who.structure, given, outputs, self._n_u)
         y = v[:, 0]
@@ -292,7 +319,7 @@ class RecursivePolynomial(Copied):
         if self._window is not None:
             first = self._with_window(self._window, u, y, errors)
         if first < y.size:
-            self._run(u[first:], y[first:], errors[first:])
+            self._run(u[first:], y[first:], errors[first:], learn=learn)
         return errors.reshape(shape)
 
     def _run(self, u: Array, y: Array, errors: Array, *, learn: bool = True) -> None:
