@@ -21,6 +21,8 @@ delay = 1
 [channels.position]
 [parameters]
 m = { value = 60, unit = "g", role = "fixed" }
+[loop.limits]
+voltage = [0.0, 12.0]
 [magnet]
 kind = "single"
 gap = "hyperbolic"

@@ -509,6 +509,11 @@ class BenchView:
                 f"channels.{late[0]}.delay is taken back in a whole record only; samples of a device come in blocks. "
                 "Remove it for live work"
             )
+        if rig.measured_input:
+            raise RigError(
+                "channels.current is measured, and taken with the sample after it, in a whole record only; samples of "
+                "a device come in blocks. Name it channels.command where it is one, or give the voltage too"
+            )
         spare = [0.0 if c.span is None else (c.span[0] + c.span[1]) / 2.0 for c in info.columns]
         record = self.record(np.array([spare]))  # so that what does not fit is told at once
         self.units = {role: record.channel(role).unit for role in roles}

@@ -192,7 +192,8 @@ def _without_disturbances(fit: Fit, tick: Callable[[], None] | None) -> Fit:
         return fit
     quiet = _quiet(fit.problem, fit.vector, tick, fit.work, _AGAIN)
     price = (fit.problem.size - (quiet.problem.size if quiet else 0)) * np.log(fit.problem.n_used)
-    return quiet if quiet is not None and quiet.criterion - fit.criterion < price else fit
+    settled = quiet is not None and (quiet.status == "converged" or fit.status != "converged")
+    return quiet if quiet is not None and settled and quiet.criterion - fit.criterion < price else fit
 
 
 def _gain_promise(fit: Fit) -> float:

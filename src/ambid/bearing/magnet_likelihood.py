@@ -205,7 +205,7 @@ def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]
             z[3] = problem.law.table(z[:1], z[2:3], begun)[0][0, 0]
             P[3, 3] += z[3] ** 2
     if flags[3]:
-        walk = begin > problem.skip or r != next(k for k, x in enumerate(problem.records) if not x.held)
+        walk = begin > problem.skip or record.later or r != next(k for k, x in enumerate(problem.records) if not x.held)
         P[-2, -2] = max((10.0 * noise[2]) ** 2, 0.5 * noise[4] ** 2 * begun["tau"] * rate)
         P[-1, -1] = float(np.var(record.u)) if walk else noise[5] ** 2  # v_offset is where the voltage begins to walk
     return z, P

@@ -67,6 +67,7 @@ class BearingRecord:
     # predictor begins anew after them. None: none.
     cut: NDArray[np.bool_] | None = None
     zero: float | None = None  # of the position, m, taken out and searched beside the numbers; None: that of the rest
+    later: bool = False  # whether a voltage that drifts has walked before it
     push: Array | None = None  # (n_samples,), m/s^2, or None, acceleration by a known force during each sample
 
     @property

@@ -477,7 +477,15 @@ def identify_nonlinear(
         If nothing can be identified from the records.
     """
     from ambid.bearing.magnet_estimate import estimate_bearing
-    from ambid.job.nonlinear_bearing import BearingWords, bearing_rig, grown_bearing, laws_of, numbers_of, take_all
+    from ambid.job.nonlinear_bearing import (
+        BearingWords,
+        bearing_rig,
+        grown_bearing,
+        laws_of,
+        less_zeros,
+        numbers_of,
+        take_all,
+    )
     from ambid.validation.nonlinear_bearing import validation, white
 
     words = BearingWords(
@@ -502,7 +510,7 @@ def identify_nonlinear(
     say("check")
     estimate = disowned(grown_bearing(fit, readings, bench))
     clock.lap("checks")
-    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=readings)
+    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=less_zeros(readings, fit))
     if second is not None:
         estimate = replace(estimate, validation=validation(estimate, second.record))
     return estimate

@@ -338,6 +338,14 @@ def _judged(fit: BearingFit, readings: Sequence[TakenRecord], rig: Rig) -> tuple
     return estimate, found
 
 
+def less_zeros(readings: Sequence[TakenRecord], fit: BearingFit) -> tuple[TakenRecord, ...]:
+    """Return readings whose records are less the zeros of their own that a fit has taken out."""
+    return tuple(
+        t if r.zero is None else replace(t, record=replace(t.record, y=r.y))
+        for t, r in zip(readings, fit.problem.records, strict=True)
+    )
+
+
 def _extended_by(fit: BearingFit, rig: Rig) -> tuple[str, ...]:
     asked = rig.magnet is not None and rig.magnet.drift
     own = any(r.zero is not None for r in fit.problem.records)

@@ -200,10 +200,11 @@ def _moved_columns(fit: Fit, causes: Sequence[Cause]) -> Array:
                 u, y, limits = problem.u.copy(), problem.y.copy(), error.kind == "limiter"
                 if error.channel in plant.inputs:
                     j = plant.inputs.index(error.channel)
-                    u[1:, j] += of_inputs[1:, j] if limits else -np.diff(problem.u[:, j])
+                    turned = -1.0 if error.channel.endswith("_current") else 1.0  # measured, where a voltage acts
+                    u[1:, j] += turned * (of_inputs[1:, j] if limits else -np.diff(problem.u[:, j]))
                 else:
                     j = plant.outputs.index(error.channel)
-                    y[used, j] += of_outputs[:, j] if limits else predicted[:, j] - problem.y[problem.skip - 1 : -1, j]
+                    y[used, j] += -of_outputs[:, j] if limits else predicted[:, j] - problem.y[problem.skip - 1 : -1, j]
                 moved = innovations(replace(problem, u=u, y=y), fit.vector)
                 assert moved is not None
                 of[error] = (1.0 if limits else problem.rate_hz) * (moved - e)

@@ -329,7 +329,9 @@ def _freed(spectra: PeriodSpectra, model: RotorModel, error: SensorError, size: 
         Y[:, :, k] -= size * _at_lines(spectra, error.kind, spectra.mean_y[:, k])
     elif error.kind == "limiter":
         k = model.inputs.index(error.channel)
-        U[:, :, k] += size * _at_lines(spectra, error.kind, spectra.mean_u[:, k])
+        U[:, :, k] += (-size if error.channel.endswith("_current") else size) * _at_lines(
+            spectra, error.kind, spectra.mean_u[:, k]
+        )
     elif error.channel in model.inputs:
         acts = 1.0 / late if not error.channel.endswith("_current") else late
         U[:, :, model.inputs.index(error.channel)] *= acts if error.kind == "lag" else 1.0 / (1.0 + size)

@@ -131,7 +131,8 @@ def _knowing(problem: BearingProblem, vector: Array, columns: Sequence[Column], 
 
 def _kept(problem: BearingProblem) -> NDArray[np.bool_]:
     """Return which of a vector are no levels of noise."""
-    return np.asarray(np.arange(problem.size) < problem.noise_slices[0].start)
+    at = np.arange(problem.size)
+    return np.asarray((at < problem.noise_slices[0].start) | (at >= problem.noise_slices[-1].stop))
 
 
 def bearing_look(fit: BearingFit, r: int) -> BearingLook | None:
@@ -139,8 +140,11 @@ def bearing_look(fit: BearingFit, r: int) -> BearingLook | None:
     over the part of it that is looked at.
     """
     whole, n_kept = fit.problem, fit.problem.noise_slices[0].start
-    record = whole.records[r].part(busiest(whole.records[r].u[:, None], _LONGEST))
-    problem = replace(whole, records=(replace(record, zero=None),), noise_center=whole.noise_center[[r]])
+    at, moving = busiest(whole.records[r].u[:, None], _LONGEST), (k for k, x in enumerate(whole.records) if not x.held)
+    left = 0.0 if (zero := whole.zero(r)) is None else fit.vector[zero] * whole.zero_scale
+    record = whole.records[r].part(at)
+    record = replace(record, later=at.start > 0 or r != next(moving), zero=None, y=record.y - [left, 0.0])
+    problem = replace(whole, records=(record,), noise_center=whole.noise_center[[r]])
     vector = np.concatenate([fit.vector[:n_kept], fit.vector[whole.noise_slices[r]]])
     base = Innovations.of(record.u.size)
     assert fit.at is not None

@@ -134,6 +134,8 @@ def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_o
             f"{record.name} is sampled at {record.rate_hz:g} Hz, the estimate's predictor at {rates}; the rates must "
             "agree. Resample the record, or identify with it"
         )
+    if noise_of is None and "zeros" in estimate.extended and not record.held:
+        record = _less_its_zero(_fit(estimate, record, estimate.noise[kind[0]], delay).problem)
     best, found = np.inf, None
     for name in kind if noise_of is None else [noise_of]:
         fit = _fit(estimate, record, estimate.noise[name], delay)
@@ -185,6 +187,15 @@ def _fit(
     return BearingFit(problem=problem, vector=vector, at=None, criterion=value, status="stalled", evaluations=1)
 
 
+def _less_its_zero(problem: BearingProblem) -> BearingRecord:
+    """Return the one record of a problem less the zero of its position, which no other record tells."""
+    record = problem.records[0]
+    fixed = tuple(replace(n, estimated=False) for n in problem.numbers)
+    alone = replace(problem, records=(replace(record, zero=0.0),), numbers=fixed, free_delay=frozenset())
+    zero = float(search(alone, alone.start()).vector[-1] * alone.zero_scale)
+    return replace(record, y=record.y - [zero, 0.0])
+
+
 def _replayed(fit: BearingFit, name: str) -> BearingReplay:
     record, first = fit.problem.records[0], fit.problem.skip
     residuals = run(fit.problem, fit.vector, 0)
@@ -209,6 +220,7 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
     the record.
     """
     replayed = replay(estimate, record)
+    record = replayed.fit.problem.records[0]  # less a zero of its own
     sound = np.all(np.isfinite(replayed.innovations), axis=1)
     errors, measured = replayed.innovations[sound], replayed.measured[sound]
     rms = np.sqrt(np.mean(errors**2, axis=0))
@@ -284,6 +296,11 @@ def record_facts(
         # a stage that is off is no limit, and one that the rig says is taken as it is
         known = outputs if np.any(record.loose > 0.0) or rig.limits is not None else roles
         checks = {**facts(bench, rig), **signal_checks(bench[[*known]], outputs)}
+        if "voltage" in known and not checks["within_limits"].passed:
+            more = (
+                f"{checks['within_limits'].detail}; or give loop.limits.voltage in the rig where the log is what acted"
+            )
+            checks["within_limits"] = replace(checks["within_limits"], detail=more)
         if robust:
             checks["resolution"] = resolution_check(bench, {k: x**2 for k, x in innovation_sd(fit, r).items()})
         if record.held:  # a coil at rest stands still
@@ -342,8 +359,11 @@ def _begun(fit: BearingFit) -> BearingProblem:
     problem, values, centre = fit.problem, fit.problem.values(fit.vector), fit.problem.noise_center.copy()
     for r, place in enumerate(problem.noise_slices):
         centre[r, list(problem.levels(r))] = fit.vector[place]
+    left = (fit.vector[z] * problem.zero_scale if (z := problem.zero(r)) else 0.0 for r in range(len(problem.records)))
+    records = tuple(replace(x, y=x.y - [zero, 0.0]) for x, zero in zip(problem.records, left, strict=True))
     return replace(
-        problem, noise_center=centre, delays={rate: problem.delay_at(fit.vector, rate) for rate in problem.delays},
+        problem, records=records, noise_center=centre,
+        delays={rate: problem.delay_at(fit.vector, rate) for rate in problem.delays},
         numbers=tuple(replace(n, value=values[n.name]) if np.isinf(n.prior_sd) else n for n in problem.numbers),
     )  # fmt: skip
 

@@ -5,15 +5,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import ambid
 from ambid.bearing.magnet_estimate import estimate_bearing
 from ambid.bearing.magnet_likelihood import bearing_moves, criterion, linearise
 from ambid.physics.sensor_errors import SensorError
-from ambid.validation.nonlinear_bearing import white
+from ambid.validation.nonlinear_bearing import replay, white
 from tests.bearing.magnet.stops import RATE, ball_between_stops
 from tests.bearing.magnet.test_drift import KNOWN, LAW, identified
 
 ZERO, N = 0.15e-3, 3000  # m, samples
 NEAR, FAR = 1.2e-3, 1.8e-3  # about which the records move
+RIG = """schema = "ambid.rig/1"
+name = "ball"
+model = "one-axis"
+[channels.voltage]
+delay = 0
+[channels.current]
+[channels.position]
+[parameters]
+m = { value = 50, unit = "g", role = "fixed" }
+c = { value = 0, unit = "N s/m", role = "fixed" }
+[magnet]
+kind = "single"
+gap = "hyperbolic"
+"""
 
 
 def ball(seed, place):
@@ -61,3 +76,17 @@ def test_records_from_one_zero_keep_it_and_say_what_another_would_move():
     values, others = (f.problem.values(f.vector) for f in (fit, again))
     k = [n.name for n in fit.problem.estimated].index("k")
     assert 1e-3 * by[k] == pytest.approx(others["k"] - values["k"], rel=0.1)
+
+
+def test_own_records_and_a_second_one_are_predicted_from_their_own_zeros():
+    records = [ball(1, NEAR), shifted(ball(11, FAR), ZERO), shifted(ball(12, FAR), -ZERO)]
+    columns = [{"voltage": r.u, "position": r.y[:, 0], "current": r.y[:, 1]} for r in records]
+    found = ambid.identify_nonlinear(
+        columns[:2], RIG, validate=columns[2], rate_hz=RATE, units={"voltage": "V", "position": "m", "current": "A"}
+    )
+    assert found.extended == ("zeros",)
+    assert found.verdict.word == "usable"
+    assert found.validation["passed"]
+    for name, taken in zip(found.noise, found.used, strict=True):
+        run = replay(found, taken.record, noise_of=name)
+        assert np.allclose(np.nanmean((run.innovations / run.sd) ** 2, axis=0), 1.0, atol=0.2)
