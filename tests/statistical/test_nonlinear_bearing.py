@@ -20,7 +20,7 @@ from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
 from tests.tiers import runs
 
-RUNS, SAMPLES = runs(40, short=20), 3000
+RUNS, SAMPLES = runs(40, short=14), 3000
 FAR = Motion(swing=0.45, swing_hz=4.0, volts=8.0, hold=3)
 LAW = MagnetLaw(pair=True)
 ESTIMATED = {"k", "s", "L_leak", "m", "R", "x_offset", "v_offset"}
