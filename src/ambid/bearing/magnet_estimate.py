@@ -113,6 +113,7 @@ def estimate_bearing(
                 fit = finished(own, [again] * len(ticks))
         if fit is None or fit.status == "failed" or white is None or not white(fit):
             fit = finished(fits, ticks)
+        fit = _folded(fit)
     if fit.status == "failed":
         raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
     return fit
@@ -304,6 +305,23 @@ def _own_zeros(fit: BearingFit, tick: Tick | None) -> BearingFit:
         taken[r] = _less(records[r], zero)
     problem = replace(problem, records=tuple(taken))
     return search(problem, _carried(more, problem), iterations=_SHORT, tick=tick)
+
+
+def _folded(fit: BearingFit) -> BearingFit:
+    """Return a fit with what longer records have left of zeros taken out of them, too."""
+    problem, vector = fit.problem, fit.vector.copy()
+    places = [problem.zero(r) for r in range(len(problem.records))]
+    if fit.status == "failed" or not any(places):
+        return fit
+    left = [0.0 if z is None else float(vector[z]) * problem.zero_scale for z in places]
+    records = tuple(
+        x if x.zero is None else replace(x, zero=x.zero + rest, y=x.y - [rest, 0.0])
+        for x, rest in zip(problem.records, left, strict=True)
+    )
+    vector[problem.noise_slices[-1].stop :] = 0.0
+    problem = replace(problem, records=records)
+    at = linearise(problem, vector)
+    return fit if at is None else replace(fit, problem=problem, vector=vector, at=at, criterion=at.criterion)
 
 
 def _hopeful(

@@ -141,9 +141,8 @@ def bearing_look(fit: BearingFit, r: int) -> BearingLook | None:
     """
     whole, n_kept = fit.problem, fit.problem.noise_slices[0].start
     at, moving = busiest(whole.records[r].u[:, None], _LONGEST), (k for k, x in enumerate(whole.records) if not x.held)
-    left = 0.0 if (zero := whole.zero(r)) is None else fit.vector[zero] * whole.zero_scale
     record = whole.records[r].part(at)
-    record = replace(record, later=at.start > 0 or r != next(moving), zero=None, y=record.y - [left, 0.0])
+    record = replace(record, later=at.start > 0 or r != next(moving), zero=None)
     problem = replace(whole, records=(record,), noise_center=whole.noise_center[[r]])
     vector = np.concatenate([fit.vector[:n_kept], fit.vector[whole.noise_slices[r]]])
     base = Innovations.of(record.u.size)

@@ -359,10 +359,8 @@ def _begun(fit: BearingFit) -> BearingProblem:
     problem, values, centre = fit.problem, fit.problem.values(fit.vector), fit.problem.noise_center.copy()
     for r, place in enumerate(problem.noise_slices):
         centre[r, list(problem.levels(r))] = fit.vector[place]
-    left = (fit.vector[z] * problem.zero_scale if (z := problem.zero(r)) else 0.0 for r in range(len(problem.records)))
-    records = tuple(replace(x, y=x.y - [zero, 0.0]) for x, zero in zip(problem.records, left, strict=True))
     return replace(
-        problem, records=records, noise_center=centre,
+        problem, noise_center=centre,
         delays={rate: problem.delay_at(fit.vector, rate) for rate in problem.delays},
         numbers=tuple(replace(n, value=values[n.name]) if np.isinf(n.prior_sd) else n for n in problem.numbers),
     )  # fmt: skip
