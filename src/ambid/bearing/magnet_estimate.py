@@ -299,25 +299,17 @@ def _own_zeros(fit: BearingFit, tick: Tick | None) -> BearingFit:
     more = search(problem, begun, iterations=_LONG, tick=tick)
     if more.status == "failed" or _bic(more) >= _bic(fit):
         return fit
-    left = more.vector[problem.noise_slices[-1].stop :] * problem.zero_scale
-    taken = list(records)
-    for r, zero in zip(others, left.tolist(), strict=True):
-        taken[r] = _less(records[r], zero)
-    problem = replace(problem, records=tuple(taken))
-    return search(problem, _carried(more, problem), iterations=_SHORT, tick=tick)
+    return _folded(more)
 
 
 def _folded(fit: BearingFit) -> BearingFit:
-    """Return a fit with what longer records have left of zeros taken out of them, too."""
+    """Return a fit with what is found, or left, of zeros taken out of the records that have their own."""
     problem, vector = fit.problem, fit.vector.copy()
     places = [problem.zero(r) for r in range(len(problem.records))]
     if fit.status == "failed" or not any(places):
         return fit
     left = [0.0 if z is None else float(vector[z]) * problem.zero_scale for z in places]
-    records = tuple(
-        x if x.zero is None else replace(x, zero=x.zero + rest, y=x.y - [rest, 0.0])
-        for x, rest in zip(problem.records, left, strict=True)
-    )
+    records = tuple(x if x.zero is None else _less(x, rest) for x, rest in zip(problem.records, left, strict=True))
     vector[problem.noise_slices[-1].stop :] = 0.0
     problem = replace(problem, records=records)
     at = linearise(problem, vector)
@@ -334,7 +326,7 @@ def _hopeful(
 
 
 def _less(record: BearingRecord, zero: float) -> BearingRecord:
-    return replace(record, zero=zero, y=record.y - [zero, 0.0])
+    return replace(record, zero=(record.zero or 0.0) + zero, y=record.y - [zero, 0.0])
 
 
 def _with_zeros_of(fit: BearingFit, records: Sequence[BearingRecord]) -> tuple[BearingRecord, ...]:

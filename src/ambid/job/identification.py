@@ -287,8 +287,10 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
     if last is began or any(not last.checks[name].passed for name in OF_THE_MODEL & last.checks.keys()):
         return first
     grown = replace(_concluded(last, rig, bench, delay_how), extended=told(fit, taken))
-    if worse(first.checks, grown.checks) or not taken:
-        return first if worse(first.checks, grown.checks) else grown
+    if worse(first.checks, grown.checks):
+        return first
+    if not taken:
+        return grown
     moved = {name: math.hypot(sd, grown[name].value - first[name].value) for name, sd in grown.bias_sd.items()}
     return replace(grown, bias_sd=moved)
 
